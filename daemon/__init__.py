@@ -1,0 +1,1 @@
+"""What runs: configuration, service, routine, recorder, control socket and command line."""
