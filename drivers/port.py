@@ -39,7 +39,7 @@ _WRITE_S = 2.0  # a line that takes no bytes for so long is lost
 BITS_PER_BYTE = 10  # 8N1
 
 
-class Stopped(Exception):  # noqa: N818 - it is a request, not a fault
+class Stopped(Exception):
     """Somebody asked the port's user to stop."""
 
 
@@ -173,4 +173,4 @@ def _open_error(path: str, baud: int, error: Exception) -> DeviceError:
         return DeviceBusy(
             f"{path}: another program holds it", f"find it by `fuser -v {path}` and stop it, then start again"
         )
-    return DeviceNotFound(f"{path}: not a usable serial port: {error}", "correct the port in the configuration")
+    return DeviceNotFound(f"{path}: not a usable serial port: {error}", "correct it in the configuration")
