@@ -1,0 +1,221 @@
+"""Passes to a result: the mount, what it is worth, and whether to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+from operator import add
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polecal.calib import moments, solve
+from polecal.calib.acceptance import Criteria, Verdict, judge
+from polecal.calib.coverage import Need, Slice, coverage, slice_of
+from polecal.calib.geometry import Array
+from polecal.calib.moments import Moments
+from polecal.calib.observations import PARAMETERS, CalibrationError, Kind, Mount, Returns, axis_shift_m
+from polecal.calib.uncertainty import FEWEST_PASSES, from_model, jackknife
+
+MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
+"""What a hand measurement is worth where nothing is said: 10 cm, 5°."""
+
+_LAST_PASSES = 3  # the rate of improvement is what these brought
+_FEWEST_POLE_RETURNS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """One approach in which the pole is seen, as moments by slice of platform yaw and kind."""
+
+    id: int
+    blocks: dict[tuple[int, Kind], Moments]
+
+    def total(self, kind: Kind) -> Moments:
+        """Give the moments of one kind, over all slices."""
+        return sum_of(block for (_, of_kind), block in self.blocks.items() if of_kind is kind)
+
+    @property
+    def pole_returns(self) -> dict[int, int]:
+        """How many pole returns, by slice."""
+        return {part: block.count for (part, kind), block in self.blocks.items() if kind is Kind.POLE}
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What is known and asked for before any data: hand measurement, pole, and when a result is good."""
+
+    measured: Mount
+    measured_sigma: Mount = MEASURED_SIGMA
+    pole_radius_m: float = 0.0
+    hold: frozenset[str] = frozenset()
+    criteria: Criteria = field(default_factory=Criteria)
+    need: Need = field(default_factory=Need)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A mount, and how far to trust it.
+
+    ``sigma`` has the same names and units as the mount; of what is ``held`` it is the hand measurement's.
+    ``covariance`` is (6, 6) in m and rad, order `PARAMETERS`. Costs are √c of Eq. 7 in m, after pole
+    returns were moved to the pole's axis. ``improvement`` is by how much of itself √c over all data fell
+    through the last passes, or None before there are enough.
+    """
+
+    mount: Mount
+    cost_m: float
+    measured_cost_m: float
+    sigma: Mount
+    covariance: Array
+    held: tuple[str, ...]
+    improvement: float | None
+    slices: tuple[Slice, ...]
+    passes: int
+    returns: dict[Kind, int]
+    verdict: Verdict
+
+
+def sum_of(blocks: Iterable[Moments]) -> Moments:
+    """Add up moments."""
+    return reduce(add, blocks, moments.zero())
+
+
+def split(returns: Returns, slice_deg: int) -> dict[tuple[int, Kind], Moments]:
+    """Sum up returns by slice of platform yaw and kind."""
+    slices = slice_of(returns.rpy_rad[:, 2], slice_deg)
+    blocks = {}
+    for kind in Kind:
+        of_kind = returns.kind == kind
+        for part in np.unique(slices[of_kind]):
+            blocks[int(part), kind] = moments.of(returns[of_kind & (slices == part)])
+    return blocks
+
+
+def calibrate(
+    returns: Returns,
+    mount: Mount,
+    pole_radius_m: float = 0.0,
+    *,
+    measured_sigma: Mount = MEASURED_SIGMA,
+    hold: Collection[str] = (),
+    criteria: Criteria | None = None,
+    need: Need | None = None,
+) -> Result:
+    """Find the mount that minimises Eq. 7, starting from the measured ``mount``.
+
+    Parameters
+    ----------
+    returns
+        The cloud, in passes.
+    mount
+        As measured by hand; also what a parameter stays at that the data cannot tell.
+    pole_radius_m
+        0 is the paper's cost to the letter; else pole returns are moved to the pole's axis.
+    measured_sigma
+        What the hand measurement is worth: a parameter is held where the data know it no better.
+    hold
+        Names of `PARAMETERS` to keep as measured.
+    criteria, need
+        When the verdict is good.
+
+    Raises
+    ------
+    CalibrationError
+        Where there are not enough pole returns to speak of.
+    """
+    need = need or Need()
+    passes = [
+        Pass(int(number), split(returns[returns.pass_id == number], need.slice_deg))
+        for number in np.unique(returns.pass_id)
+    ]
+    setup = Setup(mount, measured_sigma, pole_radius_m, frozenset(hold), criteria or Criteria(), need)
+    return estimate(passes, setup, everywhere=True)
+
+
+def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) -> Result:
+    """Find the mount from passes; ``everywhere`` looks for lower minima far from the hand measurement, too.
+
+    Raises CalibrationError where there are fewer than 10 pole returns.
+    """
+    shift_m = axis_shift_m(setup.pole_radius_m)
+    parts = [(one.total(Kind.POLE).at(shift_m, 0.0), one.total(Kind.GROUND).at(0.0, 0.0)) for one in passes]
+    pole, ground = (sum_of_folded([part[kind] for part in parts]) for kind in (0, 1))
+    if pole.count < _FEWEST_POLE_RETURNS:
+        raise CalibrationError(
+            f"{pole.count} pole returns are too few to calibrate from",
+            "drive past the pole; if that was done, check its tape and that the laser's reflectivity is on",
+        )
+    q = solve.form(pole, ground)
+    without = [solve.form(pole - one_pole, ground - one_ground) for one_pole, one_ground in parts]
+    measured = setup.measured.vector
+    measured_sigma = setup.measured_sigma.vector
+    # What the data know no better than the tape measure is not taken from them. On a flat pad z is nearly
+    # free (paper.md, later work 4) and more passes hardly help: it must meet its own bound, or is held.
+    believable = measured_sigma.copy()
+    believable[2] = min(believable[2], setup.criteria.max_sigma[2])
+    held = set(setup.hold)
+    vector = measured
+    while True:
+        search = solve.minimise_globally if everywhere else solve.minimise
+        vector = search(q, np.where(_mask(held), measured, vector), held)
+        free = ~_mask(held)
+        told = solve.information(q, vector)
+        squared = solve.cost_m(q, vector) ** 2
+        if len(passes) < FEWEST_PASSES:
+            covariance = from_model(told, squared, len(passes), free)
+        else:
+            covariance = jackknife(np.stack([solve.minimise(part, vector, held) for part in without]))
+        # A scatter cannot see what no pass tells at all; what all returns, were they independent, could
+        # tell at best can.
+        best = from_model(told, squared, pole.count, free)
+        doubt = np.sqrt(np.maximum(np.diag(covariance), np.diag(best))) / believable
+        worst = int(np.argmax(doubt))
+        if doubt[worst] <= 1.0:
+            break
+        held.add(PARAMETERS[worst])
+    mask = _mask(held)
+    covariance[mask, mask] = measured_sigma[mask] ** 2
+    sigma = np.sqrt(np.diag(covariance))
+    cost_m = solve.cost_m(q, vector)
+    improvement = None
+    if len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
+        early = [sum_of_folded([part[kind] for part in parts[:-_LAST_PASSES]]) for kind in (0, 1)]
+        before = solve.minimise(solve.form(*early), vector, held)
+        improvement = solve.cost_m(q, before) / cost_m - 1.0 if cost_m else 0.0
+    slices = coverage([one.pole_returns for one in passes], setup.need)
+    verdict = judge(
+        criteria=setup.criteria,
+        need=setup.need,
+        slices=slices,
+        passes=len(passes),
+        cost_m=cost_m,
+        improvement=improvement,
+        sigma=sigma,
+        held=tuple(held),
+        shift=vector - measured,
+        measured_sigma=measured_sigma,
+    )
+    return Result(
+        mount=Mount.from_vector(vector),
+        cost_m=cost_m,
+        measured_cost_m=solve.cost_m(q, measured),
+        sigma=Mount.from_vector(sigma),
+        covariance=covariance,
+        held=tuple(name for name in PARAMETERS if name in held),
+        improvement=improvement,
+        slices=slices,
+        passes=len(passes),
+        returns={Kind.POLE: pole.count, Kind.GROUND: ground.count},
+        verdict=verdict,
+    )
+
+
+def sum_of_folded(blocks: Sequence[Moments]) -> Moments:
+    """Add up moments that `Moments.at` has folded; there must be one."""
+    return reduce(add, blocks)
+
+
+def _mask(held: Collection[str]) -> NDArray[np.bool_]:
+    return np.array([name in held for name in PARAMETERS])

@@ -1,0 +1,58 @@
+"""Rotations between the paper's frames: n (north, east, down), b and s (forward, right, down).
+
+Euler order yaw, pitch, roll: ``C = Rz(yaw) Ry(pitch) Rx(roll)``, from the turned frame to the fixed one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def rotation(rpy_rad: Array) -> Array:
+    """Give C = Rz(yaw) Ry(pitch) Rx(roll), (..., 3, 3), of (..., 3) roll, pitch, yaw in rad."""
+    c, s = np.cos(rpy_rad), np.sin(rpy_rad)
+    cr, cp, cy = c[..., 0], c[..., 1], c[..., 2]
+    sr, sp, sy = s[..., 0], s[..., 1], s[..., 2]
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_gradient(rpy_rad: Array) -> Array:
+    """Give dC/d(roll, pitch, yaw), (3, 3, 3): the first index is the angle; for one (3,) triple in rad."""
+    roll, pitch, yaw = (rotation(np.where(np.arange(3) == axis, rpy_rad, 0.0)) for axis in range(3))
+    spin = [skew(np.eye(3)[axis]) for axis in range(3)]
+    return np.stack(
+        [yaw @ pitch @ roll @ spin[0], yaw @ pitch @ spin[1] @ roll, yaw @ spin[2] @ pitch @ roll]
+    )
+
+
+def roll_pitch_yaw(matrix: Array) -> Array:
+    """Give (..., 3) roll, pitch, yaw in rad of rotations (..., 3, 3); at pitch ±90° the roll is 0 or so."""
+    return np.stack(
+        [
+            np.arctan2(matrix[..., 2, 1], matrix[..., 2, 2]),
+            np.arcsin(np.clip(-matrix[..., 2, 0], -1.0, 1.0)),
+            np.arctan2(matrix[..., 1, 0], matrix[..., 0, 0]),
+        ],
+        axis=-1,
+    )
+
+
+def skew(vector: Array) -> Array:
+    """Give the matrix (..., 3, 3) that crosses with ``vector`` (..., 3) from the left."""
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    o = np.zeros_like(x)
+    rows = ((o, -z, y), (z, o, -x), (-y, x, o))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def wrap(angle_rad: Array) -> Array:
+    """Bring angles in rad into [-π, π)."""
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi

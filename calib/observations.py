@@ -1,0 +1,167 @@
+"""What a calibration is made from: where the sensor is thought to sit, and the returns it gave."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, replace
+from enum import IntEnum
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polecal import PolecalError
+from polecal.calib.geometry import Array, rotation
+
+PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw")
+"""The six unknowns, in the order of every vector and covariance (m and rad)."""
+KEYS = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
+"""The same as they are shown and written."""
+
+
+class CalibrationError(PolecalError):
+    """The returns cannot be calibrated from: too few, of one kind, or not finite."""
+
+
+class Kind(IntEnum):
+    """What a return came from."""
+
+    POLE = 0
+    GROUND = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """The pose of the sensor on the body: origin in b (m), and Csb as roll, pitch, yaw (degrees)."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+
+    @classmethod
+    def from_vector(cls, vector: Array) -> Self:
+        """Take (6,) x, y, z in m and roll, pitch, yaw in rad; the angles are brought into ±180°."""
+        degrees = (np.degrees(vector[3:]) + 180.0) % 360.0 - 180.0
+        return cls(*(float(value) for value in (*vector[:3], *degrees)))
+
+    @property
+    def vector(self) -> Array:
+        """(6,) x, y, z in m and roll, pitch, yaw in rad."""
+        values = np.array(astuple(self), dtype=np.float64)
+        values[3:] = np.radians(values[3:])
+        return values
+
+    @property
+    def rotation(self) -> Array:
+        """Csb, (3, 3): sensor to body."""
+        return rotation(self.vector[3:])
+
+    def as_dict(self) -> dict[str, float]:
+        """Give the six values under the names of the configuration."""
+        return dict(zip(KEYS, astuple(self), strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Returns:
+    """N returns of one sensor, each with the pose that the body had when its beam was fired.
+
+    ``velocity_mps`` and ``rate_radps``, where they are known, say how that pose was changing: with them
+    a constant time offset between laser and navigation can be told from the data.
+    """
+
+    range_m: Array
+    """(N,) m."""
+    bearing_rad: Array
+    """(N,) rad, positive to the sensor's right (Eq. 1)."""
+    position_m: Array
+    """(N, 3) body origin in n, m."""
+    rpy_rad: Array
+    """(N, 3) roll, pitch, yaw of the body, rad."""
+    kind: NDArray[np.uint8]
+    """(N,) `Kind`."""
+    pass_id: NDArray[np.int64]
+    """(N,) which pass of the pole each belongs to."""
+    velocity_mps: Array | None = None
+    """(N, 3) of the body origin in n, m/s."""
+    rate_radps: Array | None = None
+    """(N, 3) angular velocity of the body, in b, rad/s."""
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
+        n = len(self.range_m)
+        wanted = {
+            "bearing_rad": (n,),
+            "position_m": (n, 3),
+            "rpy_rad": (n, 3),
+            "kind": (n,),
+            "pass_id": (n,),
+            "velocity_mps": (n, 3),
+            "rate_radps": (n, 3),
+        }
+        for name, shape in wanted.items():
+            array = getattr(self, name)
+            if array is not None and np.shape(array) != shape:
+                raise CalibrationError(f"{name} has shape {np.shape(array)}, not {shape}", "one row a return")
+        for name in ("range_m", "bearing_rad", "position_m", "rpy_rad"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise CalibrationError(
+                    f"{name} holds values that are not finite", "leave out beams without a range"
+                )
+
+    def __len__(self) -> int:
+        return len(self.range_m)
+
+    def __getitem__(self, index: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Returns:
+        return Returns(
+            self.range_m[index],
+            self.bearing_rad[index],
+            self.position_m[index],
+            self.rpy_rad[index],
+            self.kind[index],
+            self.pass_id[index],
+            None if self.velocity_mps is None else self.velocity_mps[index],
+            None if self.rate_radps is None else self.rate_radps[index],
+        )
+
+
+def points_body(range_m: Array, bearing_rad: Array, mount: Mount) -> Array:
+    """Give (N, 3) returns in b, m: Eq. 1 through the mount."""
+    flat = np.stack([range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)], axis=-1)
+    return flat @ mount.rotation[:, :2].T + mount.vector[:3]
+
+
+def points_nav(returns: Returns, mount: Mount) -> Array:
+    """Give (N, 3) returns in n, m: Eq. 2."""
+    body = points_body(returns.range_m, returns.bearing_rad, mount)
+    turned: Array = (rotation(returns.rpy_rad) @ body[:, :, None])[:, :, 0]
+    return turned + returns.position_m
+
+
+def cost(returns: Returns, mount: Mount, pole_radius_m: float = 0.0) -> float:
+    """Give √c of Eq. 7 in m, from the cloud itself.
+
+    With a pole radius each pole return is first moved along its beam to the pole's axis (`axis_shift_m`).
+    A class without returns adds nothing. Raises CalibrationError where there are no returns.
+    """
+    if not len(returns):
+        raise CalibrationError("there are no returns", "record a pass of the pole")
+    pole = returns.kind == Kind.POLE
+    shifted = returns.range_m + np.where(pole, axis_shift_m(pole_radius_m), 0.0)
+    points = points_nav(replace(returns, range_m=shifted), mount)
+    total = 0.0
+    if pole.any():
+        total += float(points[pole, 0].var() + points[pole, 1].var())  # Eq. 5
+    if not pole.all():
+        total += float(points[~pole, 2].var())  # Eq. 6
+    return float(np.sqrt(total))  # Eq. 7
+
+
+def axis_shift_m(pole_radius_m: float) -> float:
+    """How far behind its return a pole's axis lies, on average over the beams that hit it.
+
+    A beam that passes the axis at distance d meets the pole √(ρ² - d²) in front of it; over d even in ±ρ
+    the mean is πρ/4.
+    """
+    return np.pi / 4 * pole_radius_m

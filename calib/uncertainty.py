@@ -1,0 +1,41 @@
+"""The scatter between passes to a covariance.
+
+All returns of a pass share one navigation error, so that the returns' number says little: what is found
+gets better as 1/√passes (paper.md, later work 2). The jackknife leaves out one pass at a time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polecal.calib.geometry import Array, wrap
+
+FEWEST_PASSES = 4
+"""With fewer passes than this a scatter says nothing."""
+
+
+def jackknife(left_out: Array) -> Array:
+    """Give the covariance (6, 6) of the whole, from (P, 6) solutions each without one of P passes.
+
+    Units m and rad. Tukey's (P-1)/P Σ d dᵀ, d from the mean; angles are compared the short way round.
+    """
+    spread = left_out - left_out[0]
+    spread[:, 3:] = wrap(spread[:, 3:])
+    spread -= spread.mean(axis=0)
+    covariance: Array = (len(left_out) - 1) / len(left_out) * spread.T @ spread
+    return covariance
+
+
+def from_model(information: Array, cost: float, observations: int, free: NDArray[np.bool_]) -> Array:
+    """Give the covariance (6, 6) that so many independent observations of variance ``cost`` (m²) allow.
+
+    Of the ``free`` parameters only, m and rad; ``information`` is `solve.information`. What the data say
+    nothing about comes out with a huge variance, where a scatter would come out as nothing.
+    """
+    covariance = np.zeros((6, 6))
+    values, vectors = np.linalg.eigh(information[np.ix_(free, free)])
+    floor = max(values.max(initial=0.0), 1e-12) * 1e-12
+    inverse = vectors @ np.diag(1.0 / np.maximum(values, floor)) @ vectors.T
+    covariance[np.ix_(free, free)] = cost / max(1, observations) * inverse
+    return covariance
