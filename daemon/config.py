@@ -1,0 +1,347 @@
+"""The operator's YAML file as a checked, frozen Config, or every fault in it at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from polecal import PolecalError
+
+SPAN = "span"
+"""The receiver's name wherever devices are named; no laser may have it."""
+
+_VARIANTS = {100: (0.25, 0.5, 1.0), 180: (0.5, 1.0), 90: (0.5,)}
+"""Resolutions (deg) by field of view (deg) that an LMS-2xx has; 90 is the S14's only one. LMS sheet, 7."""
+
+_ONTIME_HZ = (1, 2, 4, 5, 10, 20, 50, 100, 200)
+"""Rates of NovAtel's ONTIME trigger from 1 Hz up. SPAN sheet, 5."""
+
+_SPAN_BAUDS = (9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
+_INSPVAS_BYTES = 104
+_BESTPOS_AND_TIME_BYTES = 180  # both once a second
+_BITS_PER_BYTE = 10  # 8N1
+
+
+class ConfigError(PolecalError):
+    """A configuration that cannot be used; ``faults`` has a line for each thing wrong with it."""
+
+    def __init__(self, source: str, faults: list[str]) -> None:
+        number = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+        listed = "".join(f"\n  {fault}" for fault in faults)
+        super().__init__(f"{source}: {number}{listed}", "correct the file; README.md shows a whole one")
+        self.faults = faults
+
+
+def _one_of(*allowed: float) -> AfterValidator:
+    def check(value: float) -> float:
+        if value not in allowed:
+            listed = ", ".join(f"{a:g}" if a < 1 else f"{a:.0f}" for a in allowed)
+            raise _fault(f"must be one of {listed}, not {value:g}")
+        return value
+
+    return AfterValidator(check)
+
+
+def _fault(message: str) -> PydanticCustomError:
+    return PydanticCustomError("polecal", "{message}", {"message": message})
+
+
+def _laser_name(name: str) -> str:
+    if name == SPAN:
+        raise _fault(f"{SPAN!r} is the receiver's own name")
+    return name
+
+
+def _each_once(hold: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(hold)) < len(hold):
+        raise _fault("names one unknown twice")
+    return hold
+
+
+def _at_least_one(lasers: tuple[Laser, ...]) -> tuple[Laser, ...]:
+    if not lasers:
+        raise _fault("needs at least one laser")
+    return lasers
+
+
+Positive = Annotated[float, Field(gt=0)]
+Offset = Annotated[float, Field(ge=-50, le=50)]  # a vehicle; catches millimetres taken for metres
+Angle = Annotated[float, Field(ge=-360, le=360)]
+Place = Annotated[Path, Field(strict=False)]
+PortPath = Annotated[str, StringConstraints(min_length=1)]
+Unknown = Literal["x", "y", "z", "roll", "pitch", "yaw"]
+
+
+class _Part(BaseModel):
+    # Defaults are checked too: each may clash with a neighbour that was given.
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
+    )
+
+
+class Mount(_Part):
+    """A laser's pose on the body as measured by hand: m and degrees, body FRD, order yaw pitch roll."""
+
+    x_m: Offset
+    y_m: Offset
+    z_m: Offset
+    roll_deg: Angle
+    pitch_deg: Angle
+    yaw_deg: Angle
+
+
+class MountSigma(_Part):
+    """How well the mount was measured, one standard deviation."""
+
+    xyz_m: Positive = 0.1
+    rpy_deg: Positive = 5.0
+
+
+class Laser(_Part):
+    """One laser: where it is plugged in, how it shall scan, where it sits."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[a-z0-9_-]{1,32}$"), AfterValidator(_laser_name)] = (
+        "front"
+    )
+    port: PortPath
+    baud: Annotated[int, _one_of(9600, 19200, 38400, 500000)] = 500000
+    fov_deg: Annotated[int, _one_of(90, 100, 180)] = 100
+    resolution_deg: Annotated[float, _one_of(0.25, 0.5, 1.0)] = 0.25
+    reflectivity: Literal["levels", "energy", "s14"] = "levels"
+    mount: Mount
+    mount_sigma: MountSigma = MountSigma()
+    hold: Annotated[tuple[Unknown, ...], Field(strict=False), AfterValidator(_each_once)] = ()
+
+    # Checks of two fields sit on the later one, so that a fault in a third does not hide them.
+    @field_validator("resolution_deg")
+    @classmethod
+    def _goes_with_the_field_of_view(cls, resolution_deg: float, info: ValidationInfo) -> float:
+        fov_deg = info.data.get("fov_deg")
+        if fov_deg is not None and resolution_deg not in _VARIANTS[fov_deg]:
+            can = " or ".join(f"{r:g}" for r in _VARIANTS[fov_deg])
+            raise _fault(f"{resolution_deg:g}° does not go with fov_deg {fov_deg}: needs {can}")
+        return resolution_deg
+
+    @field_validator("reflectivity")
+    @classmethod
+    def _ninety_is_an_s14(cls, reflectivity: str, info: ValidationInfo) -> str:
+        if info.data.get("fov_deg") == 90 and reflectivity != "s14":
+            raise _fault(f"only an S14 scans 90°: needs s14, not {reflectivity}, or another fov_deg")
+        return reflectivity
+
+
+class Navigation(_Part):
+    """The SPAN receiver's line and pose rate."""
+
+    port: PortPath
+    baud: Annotated[int, _one_of(*_SPAN_BAUDS)] = 230400
+    rate_hz: Annotated[int, _one_of(*_ONTIME_HZ)] = 100
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _fits_the_line(cls, rate_hz: int, info: ValidationInfo) -> int:
+        needed = (rate_hz * _INSPVAS_BYTES + _BESTPOS_AND_TIME_BYTES) * _BITS_PER_BYTE
+        baud = info.data.get("baud", needed)
+        if needed > baud:
+            raise _fault(f"{rate_hz} Hz needs {needed} bit/s, more than baud {baud}")
+        return rate_hz
+
+
+class Pole(_Part):
+    """The retro-reflective pole."""
+
+    radius_m: Annotated[float, Field(gt=0, le=1)]
+    height_m: Positive
+
+
+class Routine(_Part):
+    """What has to be driven before there is enough."""
+
+    slice_deg: Annotated[int, Field(gt=0, le=360)] = 30
+    min_pole_returns: Annotated[int, Field(ge=1)] = 100
+    min_passes: Annotated[int, Field(ge=1)] = 1
+    slices_needed: Annotated[int, Field(ge=1)] = 12
+
+    @field_validator("slice_deg")
+    @classmethod
+    def _whole_slices(cls, slice_deg: int) -> int:
+        if 360 % slice_deg:
+            raise _fault(f"{slice_deg} does not divide 360")
+        return slice_deg
+
+    @field_validator("slices_needed")
+    @classmethod
+    def _no_more_than_there_are(cls, slices_needed: int, info: ValidationInfo) -> int:
+        slice_deg = info.data.get("slice_deg")
+        if slice_deg is not None and slices_needed > 360 // slice_deg:
+            raise _fault(f"{slices_needed} of only {360 // slice_deg} slices of {slice_deg}°")
+        return slices_needed
+
+
+class MaxSigma(_Part):
+    """The largest standard deviations that an accepted calibration may have."""
+
+    xy_m: Positive = 0.02
+    z_m: Positive = 0.02
+    roll_deg: Positive = 0.1
+    pitch_deg: Positive = 0.1
+    yaw_deg: Positive = 0.1
+
+
+class Accept(_Part):
+    """What makes a calibration good enough; ``cost_m`` is on the square root of Eq. 7."""
+
+    cost_m: Positive = 0.05
+    improvement: Annotated[float, Field(gt=0, lt=1)] = 0.02
+    mode: Literal["all", "any"] = "all"
+    max_sigma: MaxSigma = MaxSigma()
+
+
+class Config(_Part):
+    """All that the daemon is told."""
+
+    state_dir: Place = Path("/var/lib/polecal")
+    runtime_dir: Place = Path("/run/polecal")
+    lasers: Annotated[tuple[Laser, ...], Field(strict=False), AfterValidator(_at_least_one)]
+    navigation: Navigation
+    pole: Pole
+    routine: Routine = Routine()
+    accept: Accept = Accept()
+
+    @property
+    def socket(self) -> Path:
+        """Where the control socket is."""
+        return self.runtime_dir / "control.sock"
+
+
+def load(path: Path | str) -> Config:
+    """Read a configuration file. Raises ConfigError."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(str(path), [f"cannot be read: {error.strerror}"]) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(str(path), [f"is not UTF-8 text: {error.reason} at byte {error.start}"]) from error
+    return loads(text, str(path))
+
+
+def loads(text: str, source: str = "configuration") -> Config:
+    """Check a configuration given as YAML text; ``source`` names it in errors. Raises ConfigError."""
+    try:
+        content = yaml.load(text, _Loader)  # noqa: S506 - a SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        at = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise ConfigError(source, [f"{at}{error.problem}"]) from error
+    except yaml.YAMLError as error:
+        raise ConfigError(source, [" ".join(str(error).split())]) from error
+    if not isinstance(content, dict):
+        found = "is empty" if content is None else f"is a {type(content).__name__}"
+        raise ConfigError(source, [f"{found}, not keys with values"])
+    faults = []
+    try:
+        config = Config.model_validate(content)
+    except ValidationError as error:
+        faults = [_line(details) for details in error.errors(include_url=False)]
+    faults += _clashes(content)
+    if faults:
+        raise ConfigError(source, faults)
+    return config
+
+
+def dump(config: Config) -> str:
+    """Write a configuration as YAML that loads to an equal one, every default spelt out."""
+    return yaml.dump(config.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False)
+
+
+def _clashes(content: dict[Any, Any]) -> list[str]:
+    """Find names and ports given twice; on the raw content, so that other faults do not hide them."""
+    lasers = content.get("lasers")
+    navigation = content.get("navigation")
+    named: list[tuple[str, object]] = []
+    plugged: list[tuple[str, object]] = []
+    for i, laser in enumerate(lasers if isinstance(lasers, list) else []):
+        if isinstance(laser, dict):
+            named.append((f"lasers[{i}].name", laser.get("name", Laser.model_fields["name"].default)))
+            plugged.append((f"lasers[{i}].port", laser.get("port")))
+    if isinstance(navigation, dict):
+        plugged.append(("navigation.port", navigation.get("port")))
+    faults = []
+    for pairs in (named, plugged):
+        first: dict[str, str] = {}
+        for path, value in pairs:
+            if isinstance(value, str):
+                if value in first:
+                    faults.append(f"{path}: {value!r} is {first[value]} already")
+                first.setdefault(value, path)
+    return faults
+
+
+def _line(details: ErrorDetails) -> str:
+    """Say one fault as ``path: what``."""
+    path = ""
+    for step in details["loc"]:
+        path += f"[{step}]" if isinstance(step, int) else f".{step}" if path else str(step)
+    match details["type"]:
+        case "missing":
+            what = "is missing"
+        case "extra_forbidden":
+            what = "is not a key that polecal knows"
+        case "string_too_short":
+            what = "is empty"
+        case "tuple_type":
+            what = f"must be a list, not {details['input']!r}"
+        case "model_type":
+            what = f"must be keys with values, not {details['input']!r}"
+        case "string_pattern_mismatch":
+            what = f"must be 1 to 32 of a-z 0-9 _ -, not {details['input']!r}"
+        case "polecal":
+            what = details["msg"]
+        case _:
+            given = details["input"]
+            said = f", not {given!r}" if isinstance(given, str | int | float) else ""
+            what = details["msg"][:1].lower() + details["msg"][1:] + said
+            what = what.replace("input should be", "must be")
+    return f"{path}: {what}"
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML without keys given twice, and with 1e-3 a number, as in YAML 1.2."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        problem=f"key {key.value!r} is given twice", problem_mark=key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes the strings that `_Loader` would take for numbers."""
+
+
+for _either in (_Loader, _Dumper):
+    _either.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
+        list("-+.0123456789"),
+    )
