@@ -207,4 +207,5 @@ def _schedule(length_m: float, rng: np.random.Generator) -> tuple[Floats, Floats
         speeds += [0.0] * int(_PAUSE_S / _TICK_S)
     window = np.hanning(int(0.8 / _TICK_S) + 1)
     smooth = np.convolve(np.array(speeds), window / window.sum())
-    return np.arange(len(smooth) + 1) * _TICK_S, np.concatenate([[0.0], np.cumsum(smooth) * _TICK_S])
+    along = np.concatenate([[0.0], np.cumsum(smooth) * _TICK_S])
+    return np.arange(len(along), dtype=np.float64) * _TICK_S, along.astype(np.float64)

@@ -123,7 +123,7 @@ class EmulatedDevice(ABC):
         self._ear_free_ns = start + len(data) * byte_ns
 
     def transmit(self, t_ns: int, host_baud: int) -> bytes:
-        """Return all bytes that have left the device by ``t_ns`` since the last call, as the host hears them."""
+        """Return what has left the device by ``t_ns`` since the last call, as the host hears it."""
         self._advance(t_ns)
         return b"".join(garble(data, baud, host_baud, self._noise) for baud, data in self._line.take())
 

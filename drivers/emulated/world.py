@@ -52,7 +52,8 @@ class MountPose:
     @property
     def matrix(self) -> Floats:
         """Return the rotation sensor to body, (3, 3)."""
-        return rotation(np.deg2rad([[self.roll_deg, self.pitch_deg, self.yaw_deg]]))[0]
+        matrix: Floats = rotation(np.deg2rad([[self.roll_deg, self.pitch_deg, self.yaw_deg]]))[0]
+        return matrix
 
 
 HAND_MEASURED = MountPose(0.0, -0.35, -1.0, 0.0, -8.0, 0.0)
