@@ -1,5 +1,31 @@
 """SICK LMS-2xx lasers: serial bytes to scans, and the conversation that gets them."""
 
 from polecal.drivers.sick_lms.framer import Frame, Framer, Skip
+from polecal.drivers.sick_lms.scans import (
+    REVOLUTION_S,
+    SCAN_CODES,
+    Decoded,
+    Interlace,
+    NoRange,
+    Scan,
+    beam_ages_s,
+    bearings_rad,
+    decode,
+)
+from polecal.drivers.sick_lms.telegrams import build
 
-__all__ = ["Frame", "Framer", "Skip"]
+__all__ = [
+    "REVOLUTION_S",
+    "SCAN_CODES",
+    "Decoded",
+    "Frame",
+    "Framer",
+    "Interlace",
+    "NoRange",
+    "Scan",
+    "Skip",
+    "beam_ages_s",
+    "bearings_rad",
+    "build",
+    "decode",
+]

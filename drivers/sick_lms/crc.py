@@ -22,9 +22,9 @@ def _shifted(words: NDArray[np.uint16]) -> NDArray[np.uint16]:
 
 def _table() -> NDArray[np.uint16]:
     """Row d is what each byte value adds when it stands d bytes from the end; (812, 256) uint16."""
-    value = np.arange(256, dtype=np.uint16)
+    value: NDArray[np.uint16] = np.arange(256, dtype=np.uint16)
     rows = [value]  # the last byte is added as it is, and has no step after it
-    row = _shifted(value) ^ (value << 8)
+    row: NDArray[np.uint16] = (_shifted(value) ^ (value << 8)).astype(np.uint16)
     while len(rows) < _CHECKED_BYTES:
         rows.append(row)
         row = _shifted(row)
