@@ -64,6 +64,7 @@ class MessageId(IntEnum):
     MARK3TIME = 1075
     MARK4TIME = 1076
     MARK1TIME = 1130
+    WAASECUTOFF = 505
     PSRDOP2 = 1163
     SERIALCONFIG = 1246
     IMURATEPVAS = 1305
@@ -88,10 +89,12 @@ class InsStatus(IntEnum):
     INS_INACTIVE = 0
     INS_ALIGNING = 1
     INS_HIGH_VARIANCE = 2
+    INS_SOLUTION_NOT_GOOD = 2  # older firmware's word for it
     INS_SOLUTION_GOOD = 3
     TEST_ALIGNING = 4
     TEST_SOLUTION_GOOD = 5
     INS_SOLUTION_FREE = 6
+    INS_BAD_GPS_AGREEMENT = 6  # older firmware's
     INS_ALIGNMENT_COMPLETE = 7
     DETERMINING_ORIENTATION = 8
     WAITING_INITIALPOS = 9
@@ -282,3 +285,124 @@ class ExtendedStatus(IntFlag):
     CONVERGED = 1 << 6
     DEAD_RECKONING = 1 << 11
     ALIGNMENT_DIRECTION_VERIFIED = 1 << 25
+
+
+class ImuType(IntEnum):
+    """IMU types of INSCONFIG and RAWIMUX that SPAN receivers are sold with (makers' message table)."""
+
+    UNKNOWN = 0
+    HG1700_AG11 = 1
+    HG1700_AG17 = 4
+    HG1900_CA29 = 5
+    LN200 = 8
+    LN200_400HZ = 9
+    HG1700_AG58 = 11
+    HG1700_AG62 = 12
+    IMAR_FSAS = 13
+    KVH_COTS = 16
+    LITEF_LCI1 = 19
+    HG1930_AA99 = 20
+    ISA100C = 26
+    HG1900_CA50 = 27
+    HG1930_CA50 = 28
+    ADIS16488 = 31
+    STIM300 = 32
+    KVH_1750 = 33
+    ISA100 = 34
+    ISA100_400HZ = 38
+    ISA100C_400HZ = 39
+    EPSON_G320 = 41
+    KVH_1725 = 45
+    KVH_1775 = 46
+    LITEF_MICROIMU = 52
+    STIM300D = 56
+    HG4930_AN01 = 58
+    EPSON_G370 = 61
+    EPSON_G320_200HZ = 62
+    HG4930_AN04 = 68
+    HG4930_AN04_400HZ = 69
+
+
+class InsProfile(IntEnum):
+    """How the vehicle moves, as the receiver was told (SETINSPROFILE)."""
+
+    DEFAULT = 0
+    LAND = 1
+    MARINE = 2
+    FIXEDWING = 3
+    FOOT = 4
+    VTOL = 5
+    RAIL = 6
+    AGRICULTURE = 7
+    LAND_PLUS = 33
+    MARINE_PLUS = 34
+
+
+class AlignmentMode(IntEnum):
+    """How the receiver aligns (sheet section 5)."""
+
+    UNAIDED = 0
+    AIDED_STATIC = 1
+    AIDED_TRANSFER = 2
+    AUTOMATIC = 3
+    STATIC = 4
+    KINEMATIC = 5
+
+
+class InsOffset(IntEnum):
+    """What a translation or rotation of INSCONFIG leads to (SETINSTRANSLATION, SETINSROTATION)."""
+
+    INVALID = 0
+    ANT1 = 1
+    ANT2 = 2
+    EXTERNAL = 3
+    USER = 4
+    MARK1 = 5
+    MARK2 = 6
+    GIMBAL = 7
+    ALIGN = 8
+    MARK3 = 9
+    MARK4 = 10
+    RBV = 11
+    RBM = 12
+
+
+class OffsetFrame(IntEnum):
+    """The frame that an INSCONFIG item is given in."""
+
+    IMUBODY = 0
+    VEHICLE = 1
+    UNKNOWN = 2
+
+
+class OffsetSource(IntEnum):
+    """Where an INSCONFIG item came from."""
+
+    NONE = 0
+    FROM_NVM = 1
+    CALIBRATING = 2
+    CALIBRATED = 3
+    FROM_COMMAND = 4
+    RESET = 5
+    FROM_DUAL_ANT = 6
+    INS_CONVERGING = 7
+    INSUFFICIENT_SPEED = 8
+    HIGH_ROTATION = 9
+
+
+class StatusWord(IntEnum):
+    """Which word of the receiver's status an event is about (RXSTATUSEVENT)."""
+
+    ERROR = 0
+    STATUS = 1
+    AUX1 = 2
+    AUX2 = 3
+    AUX3 = 4
+    AUX4 = 5
+
+
+class StatusEvent(IntEnum):
+    """What happened to a bit of a status word (RXSTATUSEVENT)."""
+
+    CLEAR = 0
+    SET = 1

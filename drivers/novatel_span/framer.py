@@ -173,7 +173,7 @@ class Frame:
 
     @property
     def text(self) -> str:
-        """A text frame's line without its end; of a reply "OK" or "ERROR:...", of a prompt the port's name."""
+        """A text frame's line without its end; "OK" or "ERROR:..." of a reply, of a prompt its port."""
         if self.kind in _BINARY_KINDS:
             return ""
         line = self.data.decode("ascii", "replace").strip("\r\n")

@@ -1,0 +1,318 @@
+"""A SPAN receiver on a serial line: found at its rate, set to ours, made to log poses, left silent.
+
+The receiver answers a command in the form in which it was given, between its logs; replies may be
+switched off, and ASCII commands refused altogether (INTERFACEMODE). So each step is judged by the reply
+where one comes, and by the data in any case (sheet 1.6, 5). Nothing is ever saved in the receiver.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+
+from polecal.drivers.device import Device
+from polecal.drivers.errors import DeviceError, DeviceNotFound, DeviceProtocolError
+from polecal.drivers.novatel_span.commands import Command, com_config, log, serial_config, unlog_all
+from polecal.drivers.novatel_span.enums import FINE_TIME, Component, MessageId, TimeStatus, Trigger
+from polecal.drivers.novatel_span.framer import Frame, Framer, Kind
+from polecal.drivers.novatel_span.logs import Response, Version, parse
+from polecal.drivers.port import BITS_PER_BYTE, Chunk, Port, Tap
+
+RATES = (115200, 9600, 230400, 57600, 38400, 19200, 460800, 921600)
+"""Rates at which a receiver is looked for after the configured one, the likely ones first, bit/s."""
+
+PERIODS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.5)
+"""ONTIME periods below 1 s that a receiver takes; above, whole seconds (sheet section 5)."""
+
+FRAME_BYTES = {
+    MessageId.INSPVAS: 104,
+    MessageId.INSPVAX: 158,
+    MessageId.BESTPOS: 104,
+    MessageId.TIME: 76,
+}
+"""What a log takes on the line (sheet section 5)."""
+
+POSES = (MessageId.INSPVAS, MessageId.INSPVAX)
+"""The pose logs, in the order in which they are asked for."""
+
+SLOW_LOGS = (MessageId.BESTPOS, MessageId.TIME)
+"""The logs that are asked for once a second besides."""
+
+USABLE = 0.95
+"""How much of the line the logs may fill."""
+
+_PORT_OF_ADDRESS = {1: "COM1", 2: "COM2", 3: "COM3"}  # a header's port address // 32 (sheet 3.6)
+
+
+class NovatelSpan(Device):
+    """A NovAtel SPAN receiver (OEM4 to OEM7).
+
+    rate_hz: of the pose log, one of 1 / `PERIODS_S` or 1 / whole seconds.
+    """
+
+    kind = "novatel_span"
+
+    answer_s = 0.7
+    """How long an answer may take: a reply at 9600 bit/s takes 15 ms, the receiver's tail 170 ms."""
+    patience_s = 3.0
+    """How long it may take behind what a busy line has still to send."""
+    quiet_s = 0.25
+    """A line without a byte for so long has said everything."""
+
+    def __init__(self, name: str, path: str, baud: int, tap: Tap, *, rate_hz: float = 100.0) -> None:
+        super().__init__(name, path, baud, tap)
+        self.rate_hz = rate_hz
+        self.silence_s = max(Device.silence_s, 3.0 / rate_hz)
+        self.pose: MessageId | None = None
+        """The pose log that the receiver sends."""
+        self.results: dict[str, str] = {}
+        """What the receiver answered to each command of the last set-up: OK, ERROR:..., or nothing."""
+        self._talk: _Talk | None = None
+
+    def _set_up(self, port: Port) -> None:
+        period_s = self._period_s()
+        self.pose, self.results, self._talk = None, {}, None
+        self._talk = self._find(port)
+        self._talk = self._set_rate(port, self._talk)
+        self._say_who(self._talk)
+        self.pose = self._request_pose(self._talk, port, period_s)
+        for message in SLOW_LOGS:
+            command = log(message, Trigger.ONTIME, 1.0)
+            if (answer := self._ask(self._talk, command)).startswith("ERROR"):
+                self._log.warning("the receiver refuses a log", command=command.text, answer=answer)
+        self._await_pose(self._talk, self.pose, period_s)
+
+    def _heard(self, chunk: Chunk) -> bool:
+        assert self._talk is not None
+        return any(frame.message_id == self.pose for frame in self._talk.take(chunk))
+
+    def _leave(self, port: Port) -> None:
+        if self._talk is not None:
+            self._talk.start_line()
+            self._talk.ask(unlog_all(held=False), self.answer_s)
+
+    def _period_s(self) -> float:
+        period_s = 1.0 / self.rate_hz
+        for known_s in (*PERIODS_S, float(max(1, round(period_s)))):
+            if abs(period_s - known_s) < 1e-6:
+                return known_s
+        rates = ", ".join(f"{1 / p:g}" for p in PERIODS_S)
+        raise DeviceError(
+            f"{self.name}: a receiver cannot log at {self.rate_hz:g} Hz", f"set rate_hz to one of {rates}, 1"
+        )
+
+    def _find(self, port: Port) -> _Talk:
+        heard: list[str] = []
+        rates = dict.fromkeys((self.baud, *RATES))
+        for binary in (False, True):  # a port in NOVATELBINARY mode hears no ASCII
+            for baud in rates:
+                if port.baud != baud:
+                    port.set_baud(baud)
+                talk = _Talk(port, binary)
+                if self._probe(talk):
+                    return talk
+                if talk.checked:  # the rate is right, so it may listen to the other form
+                    talk = _Talk(port, not binary)
+                    if self._probe(talk):
+                        return talk
+                    raise DeviceProtocolError(
+                        f"{self.name} on {port.path}: a receiver sends logs at {baud} bit/s, "
+                        "but takes no command",
+                        "set its port to take them, from another port: INTERFACEMODE COM1 NOVATEL NOVATEL ON",
+                    )
+                if not binary:
+                    heard.append(f"{baud}: {talk.heard_bytes} bytes")
+        raise DeviceNotFound(
+            f"{self.name}: no NovAtel receiver on {port.path} (heard without a whole frame, at bit/s: "
+            f"{', '.join(heard)})",
+            "check its power and cable, and that this is the receiver's port and not another device's",
+        )
+
+    def _probe(self, talk: _Talk) -> bool:
+        """Stop what the port sends, ask who it is, and say whether anything answers to that."""
+        talk.start_line()
+        talk.send(unlog_all(held=True))
+        talk.send(log(MessageId.VERSION, Trigger.ONCE))
+        if not talk.listen(self.answer_s, lambda _: talk.answered) and talk.checked:
+            talk.listen(self.patience_s, lambda _: talk.answered)
+        if talk.answered:
+            talk.drain(self.quiet_s, self.patience_s)
+        return talk.answered
+
+    def _set_rate(self, port: Port, talk: _Talk) -> _Talk:
+        """Bring receiver and host to the configured rate, or say why they stay where they are."""
+        found = port.baud
+        com = re.fullmatch(r"COM(\d+)", talk.port_name)
+        if com is None:
+            if talk.has_rate:
+                self._check_line(POSES[0], found)
+            if found != self.baud:
+                self._log.warning(
+                    "the receiver's port has no rate to set", its_port=talk.port_name, baud=found
+                )
+            return talk
+        self._check_line(POSES[0], self.baud)
+        if found == self.baud:
+            return talk
+        for command in (serial_config(int(com[1]), self.baud), com_config(int(com[1]), self.baud)):
+            if talk.binary and command.binary is None:
+                continue
+            if self._ask(talk, command).startswith("ERROR"):  # the older generations know only the second
+                continue
+            port.set_baud(self.baud)
+            moved = _Talk(port, talk.binary, talk.port_name)
+            if any(self._probe(moved) for _ in range(3)):
+                return moved
+            port.set_baud(found)
+            talk = _Talk(port, talk.binary, talk.port_name)
+            if not any(self._probe(talk) for _ in range(3)):
+                raise DeviceProtocolError(
+                    f"{self.name} on {port.path}: silent at {found} and at {self.baud} bit/s "
+                    f"after {command.text}",
+                    "it is looked for again; if this repeats, the adapter may not do that rate: set another",
+                )
+        self._check_line(POSES[0], found)
+        self._log.warning(
+            "the receiver stays at its rate", baud=found, wanted=self.baud, answers=self.results
+        )
+        return talk
+
+    def _check_line(self, pose: MessageId, baud: int) -> None:
+        """Raise DeviceError, with the arithmetic, where the logs do not fit the line."""
+        sizes = [FRAME_BYTES[message] for message in SLOW_LOGS]
+        bits_per_s = (FRAME_BYTES[pose] * self.rate_hz + sum(sizes)) * BITS_PER_BYTE
+        if bits_per_s > USABLE * baud:
+            slow = " + ".join(map(str, sizes))
+            raise DeviceError(
+                f"{self.name}: {pose.name}B at {self.rate_hz:g} Hz does not fit {baud} bit/s: "
+                f"({FRAME_BYTES[pose]} B x {self.rate_hz:g} + {slow} B) x {BITS_PER_BYTE} bits = "
+                f"{bits_per_s:.0f} bit/s, {bits_per_s / baud:.0%} of the line (at most {USABLE:.0%})",
+                "raise navigation.baud or lower navigation.rate_hz",
+            )
+
+    def _request_pose(self, talk: _Talk, port: Port, period_s: float) -> MessageId:
+        refused = []
+        for pose in POSES:
+            if talk.has_rate:
+                self._check_line(pose, port.baud)
+            command = log(pose, Trigger.ONTIME, period_s)
+            talk.ids.clear()
+            answer = self._ask(talk, command)
+            if not answer.startswith("ERROR"):
+                return pose
+            refused.append(f"{command.text}: {answer}")
+        raise DeviceProtocolError(
+            f"{self.name} on {port.path}: the receiver refuses every pose log ({'; '.join(refused)})",
+            "its model must include SPAN (see VERSION), and have an IMU",
+        )
+
+    def _ask(self, talk: _Talk, command: Command) -> str:
+        answer = talk.ask(command, self.patience_s if talk.replies else self.answer_s)
+        self.results = {**self.results, command.text: answer}
+        return answer
+
+    def _await_pose(self, talk: _Talk, pose: MessageId, period_s: float) -> None:
+        if pose in talk.ids or talk.listen(self.patience_s + 2 * period_s, lambda _: pose in talk.ids):
+            return
+        clock = talk.time_status
+        why = "" if clock is None or clock in FINE_TIME else f"; the receiver's time is {_word(clock)}"
+        raise DeviceProtocolError(
+            f"{self.name} on {talk.port.path}: no {pose.name}B came, though it was asked for{why}",
+            "inertial logs start once the receiver has time from satellites and hears its IMU",
+        )
+
+    def _say_who(self, talk: _Talk) -> None:
+        self.identity = "NovAtel receiver"
+        for part in talk.version.components if talk.version else ():
+            if part.component == Component.GPSCARD:
+                self.identity = f"NovAtel {part.hardware}, model {part.model}, firmware {part.software}"
+
+
+class _Talk:
+    """What was said and heard at one rate, in one form of command."""
+
+    def __init__(self, port: Port, binary: bool, port_name: str = "") -> None:
+        self.port = port
+        self.binary = binary
+        self.port_name = port_name
+        """What the receiver calls its port, as far as it has said."""
+        self.checked = False
+        """Whether anything with a right checksum came."""
+        self.answered = False
+        """Whether anything came that only an understood command can have caused."""
+        self.replies = False
+        """Whether commands get replies."""
+        self.heard_bytes = 0
+        self.ids: set[int | None] = set()
+        self.version: Version | None = None
+        self.time_status: TimeStatus | int | None = None
+        self._framer = Framer()
+        self._answers: deque[str] = deque()
+
+    @property
+    def has_rate(self) -> bool:
+        """Whether the receiver's port is a real line, as far as is known; USB and ICOM ports are none."""
+        return not self.port_name or re.fullmatch(r"COM\d+", self.port_name) is not None
+
+    def start_line(self) -> None:
+        """End whatever half a line the receiver has heard."""
+        if not self.binary:
+            self.port.write(b"\r\n")
+
+    def send(self, command: Command) -> None:
+        self.port.write(command.binary if self.binary and command.binary else command.ascii)
+
+    def ask(self, command: Command, timeout_s: float) -> str:
+        """Send a command; return "OK", "ERROR:" and the receiver's text, or "" where no reply came."""
+        self._answers.clear()
+        self.send(command)
+        self.listen(timeout_s, lambda _: bool(self._answers))
+        return self._answers.popleft() if self._answers else ""
+
+    def listen(self, timeout_s: float, enough: Callable[[Frame], bool]) -> bool:
+        """Read until a frame is ``enough``, and return True, or for ``timeout_s``."""
+        deadline_s = time.monotonic() + timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            chunk = self.port.read(left_s)
+            if chunk is not None and any([enough(frame) for frame in self.take(chunk)]):
+                return True
+        return False
+
+    def drain(self, quiet_s: float, timeout_s: float) -> None:
+        """Read until nothing has come for ``quiet_s``, at most for ``timeout_s``."""
+        deadline_s = time.monotonic() + timeout_s
+        while time.monotonic() < deadline_s and (chunk := self.port.read(quiet_s)) is not None:
+            self.take(chunk)
+
+    def take(self, chunk: Chunk) -> list[Frame]:
+        """Take bytes; note what they say."""
+        self.heard_bytes += len(chunk.data)
+        frames = self._framer.feed(chunk.data, chunk.t_ns)
+        for frame in frames:
+            self._note(frame)
+        return frames
+
+    def _note(self, frame: Frame) -> None:
+        if frame.kind is Kind.PROMPT:
+            self.port_name = frame.text
+        elif frame.kind is Kind.REPLY:
+            self.answered = self.replies = True
+            self._answers.append(frame.text)
+        elif frame.kind.checked:
+            self.checked = True
+            self.ids.add(frame.message_id)
+            self.time_status = frame.time_status or self.time_status
+            if frame.port_address is not None and not self.port_name:
+                self.port_name = _PORT_OF_ADDRESS.get(frame.port_address >> 5, "")
+            said = parse(frame) if frame.is_response or frame.message_id == MessageId.VERSION else None
+            if isinstance(said, Response):
+                self.answered = self.replies = True
+                self._answers.append("OK" if said.ok else f"ERROR:{said.text}")
+            elif isinstance(said, Version):
+                self.answered, self.version = True, said
+
+
+def _word(status: TimeStatus | int) -> str:
+    return status.name if isinstance(status, TimeStatus) else str(status)

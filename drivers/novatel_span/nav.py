@@ -1,0 +1,132 @@
+"""Pose logs to navigation states: the one thing of the receiver that the pipeline takes."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import astuple, dataclass
+
+from polecal.drivers.novatel_span.enums import InsStatus, MessageId, PositionType
+from polecal.drivers.novatel_span.framer import Frame
+from polecal.drivers.novatel_span.logs import InsPva, InsPvax, parse
+
+WEEK_NS = 604_800 * 10**9
+Triple = tuple[float, float, float]
+
+POSE_LOGS = frozenset(
+    {
+        MessageId.INSPVA,
+        MessageId.INSPVAS,
+        MessageId.IMURATEPVA,
+        MessageId.IMURATEPVAS,
+        MessageId.INSPVAX,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class NavState:
+    """Where the body was, how it stood and moved, at one moment of GPS time.
+
+    gps_ns: ns since 1980-01-06 (no leap seconds). height_m: above the ellipsoid, whichever log it came
+    from. velocity_ned_mps: north, east, down. Angles in degrees: NED <- FRD is
+    Rz(azimuth) Ry(pitch) Rx(roll). The sigmas are north, east, down and roll, pitch, azimuth; None where
+    the log has none. The point is the IMU's centre of navigation, or the offset from it that the receiver
+    was given (sheet section 4).
+    """
+
+    gps_ns: int
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    velocity_ned_mps: Triple
+    roll_deg: float
+    pitch_deg: float
+    azimuth_deg: float
+    ins_status: InsStatus | int
+    position_type: PositionType | int | None
+    position_sigma_m: Triple | None
+    velocity_sigma_mps: Triple | None
+    attitude_sigma_deg: Triple | None
+    log: str
+
+    @property
+    def good(self) -> bool:
+        """Whether the receiver calls it INS_SOLUTION_GOOD; nothing else may be used."""
+        return self.ins_status == InsStatus.INS_SOLUTION_GOOD
+
+
+def gps_ns(week: int, seconds_s: float) -> int:
+    """Return GPS time in ns since 1980-01-06."""
+    return week * WEEK_NS + round(seconds_s * 1e9)
+
+
+def nav_state(frame: Frame) -> NavState | None:
+    """Return the navigation state of a pose log's frame, good or not; None for any other frame.
+
+    The time is the body's own for INSPVA(S) and IMURATEPVA(S), whose header is rounded to the epoch, and
+    the header's for INSPVAX, which has no other (sheet section 6). A receiver that sends a log to a virtual
+    port as well sends each state twice: ask a `Deduplicator` first.
+    """
+    if frame.message_id not in POSE_LOGS or frame.is_response:
+        return None
+    pose = parse(frame)
+    if pose is None or not all(map(math.isfinite, astuple(pose))):
+        return None
+    name = frame.name or ""
+    if isinstance(pose, InsPva):
+        return NavState(
+            gps_ns(pose.gps_week, pose.gps_seconds_s),
+            pose.lat_deg,
+            pose.lon_deg,
+            pose.height_ellipsoidal_m,
+            (pose.vel_north_mps, pose.vel_east_mps, -pose.vel_up_mps),
+            pose.roll_deg,
+            pose.pitch_deg,
+            pose.azimuth_deg,
+            pose.ins_status,
+            position_type=None,
+            position_sigma_m=None,
+            velocity_sigma_mps=None,
+            attitude_sigma_deg=None,
+            log=name,
+        )
+    if isinstance(pose, InsPvax):
+        return NavState(
+            (frame.week or 0) * WEEK_NS + (frame.ms or 0) * 10**6,
+            pose.lat_deg,
+            pose.lon_deg,
+            pose.height_ellipsoidal_m,
+            (pose.vel_north_mps, pose.vel_east_mps, -pose.vel_up_mps),
+            pose.roll_deg,
+            pose.pitch_deg,
+            pose.azimuth_deg,
+            pose.ins_status,
+            position_type=pose.position_type,
+            position_sigma_m=(pose.lat_sigma_m, pose.lon_sigma_m, pose.height_sigma_m),
+            velocity_sigma_mps=(
+                pose.vel_north_sigma_mps,
+                pose.vel_east_sigma_mps,
+                pose.vel_up_sigma_mps,
+            ),
+            attitude_sigma_deg=(pose.roll_sigma_deg, pose.pitch_sigma_deg, pose.azimuth_sigma_deg),
+            log=name,
+        )
+    return None
+
+
+class Deduplicator:
+    """Tells a log from its copy on a virtual port: same id, source, sequence and header time."""
+
+    _REMEMBERED = 32  # frames of a line between a log and its copy: far fewer
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[int | None, ...]] = deque(maxlen=self._REMEMBERED)
+
+    def is_new(self, frame: Frame) -> bool:
+        """Whether the frame is not a copy of one that came shortly before; to be asked once for each."""
+        key = frame.key
+        if key in self._seen:
+            return False
+        self._seen.append(key)
+        return True
