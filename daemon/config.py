@@ -40,6 +40,8 @@ _BITS_PER_BYTE = 10  # 8N1
 class ConfigError(PolecalError):
     """A configuration that cannot be used; ``faults`` has a line for each thing wrong with it."""
 
+    code = 78
+
     def __init__(self, source: str, faults: list[str]) -> None:
         number = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
         listed = "".join(f"\n  {fault}" for fault in faults)
