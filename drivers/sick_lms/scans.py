@@ -62,27 +62,25 @@ _CODES = np.array(
 
 
 class MeasuringMode(NamedTuple):
-    """What the bits of a value word are: the range's width, and the names of the flags above it.
-
-    Flags are reflector levels where there are no names.
-    """
+    """What the bits of a value word are: the range below, reflector levels or named flags above it."""
 
     range_bits: int
-    flags: tuple[str, ...]
+    levels: bool
+    flags: tuple[str, ...] = ()
 
 
 MEASURING_MODES = {  # sheet section 3.3
-    0x00: MeasuringMode(13, ("field_a", "field_b", "dazzle")),
-    0x01: MeasuringMode(13, ()),
-    0x02: MeasuringMode(13, ("field_a", "field_b", "field_c")),
-    0x03: MeasuringMode(14, ()),
-    0x04: MeasuringMode(14, ("field_a", "field_b")),
-    0x05: MeasuringMode(15, ()),
-    0x06: MeasuringMode(15, ("field_a",)),
-    0x0D: MeasuringMode(15, ("unknown",)),
-    0x0E: MeasuringMode(15, ("unknown",)),
-    0x0F: MeasuringMode(15, ("unknown",)),
-    0x3F: MeasuringMode(0, ()),
+    0x00: MeasuringMode(13, False, ("field_a", "field_b", "dazzle")),
+    0x01: MeasuringMode(13, True),
+    0x02: MeasuringMode(13, False, ("field_a", "field_b", "field_c")),
+    0x03: MeasuringMode(14, True),
+    0x04: MeasuringMode(14, False, ("field_a", "field_b")),
+    0x05: MeasuringMode(15, True),
+    0x06: MeasuringMode(15, False, ("field_a",)),
+    0x0D: MeasuringMode(15, False),
+    0x0E: MeasuringMode(15, False),
+    0x0F: MeasuringMode(15, False),
+    0x3F: MeasuringMode(0, False),
 }
 _ENERGY_WORDS = 0x3F
 _RANGE_AND_ENERGY = 0x0E
@@ -284,7 +282,7 @@ def decode(scan: Scan, measuring_mode: int) -> Decoded:
         reflectivity[first - 1 : last] = scan.energy[first - 1 : last] / 0xFF
     elif scan.energy is not None:
         reflectivity = _scaled(scan.energy, FULL_ENERGY)
-    elif not mode.flags:
+    elif mode.levels:
         reflectivity = flags.astype(np.float64) / ((1 << 16 - mode.range_bits) - 1)
     return Decoded(ranges_m, kinds, reflectivity, flags)
 
