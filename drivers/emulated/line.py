@@ -49,6 +49,10 @@ class Line:
         """Queue bytes that may leave from ``ready_ns`` on; the rate changes after the last of them."""
         self._queue.append(_Burst(ready_ns, data, then_baud))
 
+    def say(self, data: bytes) -> None:
+        """Let bytes leave at once, past the queue."""
+        self._left.append((self.baud, data))
+
     def run(self, t_ns: int) -> None:
         """Let everything leave whose last bit is through by ``t_ns``."""
         while self._queue:
