@@ -1,5 +1,6 @@
 """NovAtel SPAN receiver: bytes of its serial line to frames, logs and navigation states."""
 
+from polecal.drivers.novatel_span.bulk import columns
 from polecal.drivers.novatel_span.describe import Describer
 from polecal.drivers.novatel_span.device import NovatelSpan
 from polecal.drivers.novatel_span.enums import (
@@ -33,6 +34,7 @@ __all__ = [
     "Time",
     "TimeStatus",
     "Version",
+    "columns",
     "nav_state",
     "parse",
 ]

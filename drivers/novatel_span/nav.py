@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 from polecal.drivers.novatel_span.enums import InsStatus, MessageId, PositionType
 from polecal.drivers.novatel_span.framer import Frame
@@ -64,6 +64,8 @@ def gps_ns(week: int, seconds_s: float) -> int:
 def nav_state(frame: Frame) -> NavState | None:
     """Return the navigation state of a pose log's frame, good or not; None for any other frame.
 
+    A log with a value that is no number (infinite, NaN) is None too.
+
     The time is the body's own for INSPVA(S) and IMURATEPVA(S), whose header is rounded to the epoch, and
     the header's for INSPVAX, which has no other (sheet section 6). A receiver that sends a log to a virtual
     port as well sends each state twice: ask a `Deduplicator` first.
@@ -71,48 +73,35 @@ def nav_state(frame: Frame) -> NavState | None:
     if frame.message_id not in POSE_LOGS or frame.is_response:
         return None
     pose = parse(frame)
-    if pose is None or not all(map(math.isfinite, astuple(pose))):
-        return None
-    name = frame.name or ""
+    position_type = position_sigma_m = velocity_sigma_mps = attitude_sigma_deg = None
     if isinstance(pose, InsPva):
-        return NavState(
-            gps_ns(pose.gps_week, pose.gps_seconds_s),
-            pose.lat_deg,
-            pose.lon_deg,
-            pose.height_ellipsoidal_m,
-            (pose.vel_north_mps, pose.vel_east_mps, -pose.vel_up_mps),
-            pose.roll_deg,
-            pose.pitch_deg,
-            pose.azimuth_deg,
-            pose.ins_status,
-            position_type=None,
-            position_sigma_m=None,
-            velocity_sigma_mps=None,
-            attitude_sigma_deg=None,
-            log=name,
-        )
-    if isinstance(pose, InsPvax):
-        return NavState(
-            (frame.week or 0) * WEEK_NS + (frame.ms or 0) * 10**6,
-            pose.lat_deg,
-            pose.lon_deg,
-            pose.height_ellipsoidal_m,
-            (pose.vel_north_mps, pose.vel_east_mps, -pose.vel_up_mps),
-            pose.roll_deg,
-            pose.pitch_deg,
-            pose.azimuth_deg,
-            pose.ins_status,
-            position_type=pose.position_type,
-            position_sigma_m=(pose.lat_sigma_m, pose.lon_sigma_m, pose.height_sigma_m),
-            velocity_sigma_mps=(
-                pose.vel_north_sigma_mps,
-                pose.vel_east_sigma_mps,
-                pose.vel_up_sigma_mps,
-            ),
-            attitude_sigma_deg=(pose.roll_sigma_deg, pose.pitch_sigma_deg, pose.azimuth_sigma_deg),
-            log=name,
-        )
-    return None
+        week, seconds_s = pose.gps_week, pose.gps_seconds_s
+    elif isinstance(pose, InsPvax):
+        week, seconds_s = frame.week or 0, (frame.ms or 0) / 1000
+        position_type = pose.position_type
+        position_sigma_m = (pose.lat_sigma_m, pose.lon_sigma_m, pose.height_sigma_m)
+        velocity_sigma_mps = (pose.vel_north_sigma_mps, pose.vel_east_sigma_mps, pose.vel_up_sigma_mps)
+        attitude_sigma_deg = (pose.roll_sigma_deg, pose.pitch_sigma_deg, pose.azimuth_sigma_deg)
+    else:
+        return None
+    velocity_ned_mps = (pose.vel_north_mps, pose.vel_east_mps, -pose.vel_up_mps)
+    position = (pose.lat_deg, pose.lon_deg, pose.height_ellipsoidal_m)
+    angles_deg = (pose.roll_deg, pose.pitch_deg, pose.azimuth_deg)
+    sigmas = (position_sigma_m or ()) + (velocity_sigma_mps or ()) + (attitude_sigma_deg or ())
+    if not math.isfinite(seconds_s + sum(position + velocity_ned_mps + angles_deg + sigmas)):
+        return None
+    return NavState(
+        gps_ns(week, seconds_s),
+        *position,
+        velocity_ned_mps,
+        *angles_deg,
+        pose.ins_status,
+        position_type,
+        position_sigma_m,
+        velocity_sigma_mps,
+        attitude_sigma_deg,
+        frame.name or "",
+    )
 
 
 class Deduplicator:
