@@ -86,7 +86,7 @@ def judge(
         f"{name} comes out {_shown(index, abs(shift[index]))} from the hand measurement: measure again, "
         "or check that the pole was the only one"
         for index, name in enumerate(PARAMETERS)
-        if abs(shift[index]) > criteria.max_shift_sigmas * measured_sigma[index] and not missing
+        if abs(shift[index]) > criteria.max_shift_sigmas * measured_sigma[index]
     ]
     reasons = (*missing, *grounds, *vague, *far)
     hopeless = not missing and settled and (bool(far) or (bool(grounds) and not cheap))

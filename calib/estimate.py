@@ -16,6 +16,7 @@ from polecal.calib.coverage import Need, Slice, coverage, slice_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
 from polecal.calib.observations import PARAMETERS, CalibrationError, Kind, Mount, Returns, axis_shift_m
+from polecal.calib.solve import Scatter
 from polecal.calib.uncertainty import FEWEST_PASSES, from_model, jackknife
 
 MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
@@ -49,6 +50,8 @@ class Setup:
     measured: Mount
     measured_sigma: Mount = MEASURED_SIGMA
     pole_radius_m: float = 0.0
+    pass_error: bool = True
+    """Whether each pass may have a navigation error of its own, which weighs it down; else Eq. 7 as it is."""
     hold: frozenset[str] = frozenset()
     criteria: Criteria = field(default_factory=Criteria)
     need: Need = field(default_factory=Need)
@@ -98,6 +101,7 @@ def calibrate(
     mount: Mount,
     pole_radius_m: float = 0.0,
     *,
+    pass_error: bool = False,
     measured_sigma: Mount = MEASURED_SIGMA,
     hold: Collection[str] = (),
     criteria: Criteria | None = None,
@@ -113,6 +117,8 @@ def calibrate(
         As measured by hand; also what a parameter stays at that the data cannot tell.
     pole_radius_m
         0 is the paper's cost to the letter; else pole returns are moved to the pole's axis.
+    pass_error
+        Let each pass have a navigation error of its own: not the paper's cost, and nearer to the truth.
     measured_sigma
         What the hand measurement is worth: a parameter is held where the data know it no better.
     hold
@@ -130,7 +136,9 @@ def calibrate(
         Pass(int(number), split(returns[returns.pass_id == number], need.slice_deg))
         for number in np.unique(returns.pass_id)
     ]
-    setup = Setup(mount, measured_sigma, pole_radius_m, frozenset(hold), criteria or Criteria(), need)
+    setup = Setup(
+        mount, measured_sigma, pole_radius_m, pass_error, frozenset(hold), criteria or Criteria(), need
+    )
     return estimate(passes, setup, everywhere=True)
 
 
@@ -140,16 +148,27 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     Raises CalibrationError where there are fewer than 10 pole returns.
     """
     shift_m = axis_shift_m(setup.pole_radius_m)
-    parts = [(one.total(Kind.POLE).at(shift_m, 0.0), one.total(Kind.GROUND).at(0.0, 0.0)) for one in passes]
-    pole, ground = (sum_of_folded([part[kind] for part in parts]) for kind in (0, 1))
-    if pole.count < _FEWEST_POLE_RETURNS:
+    pole = Scatter([one.total(Kind.POLE).at(shift_m, 0.0) for one in passes], axes=(0, 1))
+    ground = Scatter([one.total(Kind.GROUND).at(0.0, 0.0) for one in passes], axes=(2,))
+    returns = {Kind.POLE: int(pole.count.sum()), Kind.GROUND: int(ground.count.sum())}
+    if returns[Kind.POLE] < _FEWEST_POLE_RETURNS:
         raise CalibrationError(
-            f"{pole.count} pole returns are too few to calibrate from",
+            f"{returns[Kind.POLE]} pole returns are too few to calibrate from",
             "drive past the pole; if that was done, check its tape and that the laser's reflectivity is on",
         )
-    q = solve.form(pole, ground)
-    without = [solve.form(pole - one_pole, ground - one_ground) for one_pole, one_ground in parts]
+    every = np.ones(len(passes), dtype=bool)
+    ratios = (np.inf, np.inf)
+
+    def form(used: NDArray[np.bool_]) -> Array:
+        return pole.form(used, ratios[0]) + ground.form(used, ratios[1])
+
+    paper_q = q = form(every)  # Eq. 7
     measured = setup.measured.vector
+    if setup.pass_error and len(passes) >= FEWEST_PASSES:
+        rough = solve.minimise(q, measured, setup.hold)
+        ratios = pole.ratio(rough), ground.ratio(rough)
+        q = form(every)
+    without = [form(every & (np.arange(len(passes)) != index)) for index in range(len(passes))]
     measured_sigma = setup.measured_sigma.vector
     # What the data know no better than the tape measure is not taken from them. On a flat pad z is nearly
     # free (paper.md, later work 4) and more passes hardly help: it must meet its own bound, or is held.
@@ -168,9 +187,13 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
         else:
             covariance = jackknife(np.stack([solve.minimise(part, vector, held) for part in without]))
         # A scatter cannot see what no pass tells at all; what all returns, were they independent, could
-        # tell at best can.
-        best = from_model(told, squared, pole.count, free)
-        doubt = np.sqrt(np.maximum(np.diag(covariance), np.diag(best))) / believable
+        # tell at best can. Where the minimum is may hide it: off level the cosine of a level sensor's pitch
+        # stretches the ranges, and noise puts it there. So the measured mount must be told from, too.
+        at_best = [
+            np.diag(from_model(solve.information(q, at), squared, returns[Kind.POLE], free))
+            for at in (vector, measured)
+        ]
+        doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*at_best))) / believable
         worst = int(np.argmax(doubt))
         if doubt[worst] <= 1.0:
             break
@@ -178,12 +201,11 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     mask = _mask(held)
     covariance[mask, mask] = measured_sigma[mask] ** 2
     sigma = np.sqrt(np.diag(covariance))
-    cost_m = solve.cost_m(q, vector)
+    cost_m = solve.cost_m(paper_q, vector)
     improvement = None
     if len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
-        early = [sum_of_folded([part[kind] for part in parts[:-_LAST_PASSES]]) for kind in (0, 1)]
-        before = solve.minimise(solve.form(*early), vector, held)
-        improvement = solve.cost_m(q, before) / cost_m - 1.0 if cost_m else 0.0
+        before = solve.minimise(form(np.arange(len(passes)) < len(passes) - _LAST_PASSES), vector, held)
+        improvement = solve.cost_m(paper_q, before) / cost_m - 1.0 if cost_m else 0.0
     slices = coverage([one.pole_returns for one in passes], setup.need)
     verdict = judge(
         criteria=setup.criteria,
@@ -200,21 +222,16 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     return Result(
         mount=Mount.from_vector(vector),
         cost_m=cost_m,
-        measured_cost_m=solve.cost_m(q, measured),
+        measured_cost_m=solve.cost_m(paper_q, measured),
         sigma=Mount.from_vector(sigma),
         covariance=covariance,
         held=tuple(name for name in PARAMETERS if name in held),
         improvement=improvement,
         slices=slices,
         passes=len(passes),
-        returns={Kind.POLE: pole.count, Kind.GROUND: ground.count},
+        returns=returns,
         verdict=verdict,
     )
-
-
-def sum_of_folded(blocks: Sequence[Moments]) -> Moments:
-    """Add up moments that `Moments.at` has folded; there must be one."""
-    return reduce(add, blocks)
 
 
 def _mask(held: Collection[str]) -> NDArray[np.bool_]:

@@ -53,15 +53,20 @@ class Moments:
         three = np.kron(np.eye(3), fold)
         return Moments(self.count, self.first @ three, three.T @ self.second @ three)
 
+    def mean(self, axis: int) -> Array:
+        """Give the (width,) mean of the features of one axis of n: mean = m h, m."""
+        return self.first[self._part(axis)] / max(1, self.count)
+
     def covariance(self, axis: int) -> Array:
         """Give the (width, width) covariance of the features of one axis of n: var = hᵀ S h, m²."""
-        if not self.count:
-            return np.zeros((len(self.first) // 3,) * 2)
-        width = len(self.first) // 3
-        part = slice(axis * width, (axis + 1) * width)
-        mean = self.first[part] / self.count
-        covariance = self.second[part, part] / self.count - np.outer(mean, mean)
+        part = self._part(axis)
+        mean = self.mean(axis)
+        covariance = self.second[part, part] / max(1, self.count) - np.outer(mean, mean)
         return (covariance + covariance.T) / 2
+
+    def _part(self, axis: int) -> slice:
+        width = len(self.first) // 3
+        return slice(axis * width, (axis + 1) * width)
 
 
 def zero() -> Moments:

@@ -6,11 +6,12 @@ r_b, 1], so that a solution costs the same for a hundred returns and for a milli
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polecal.calib.geometry import Array, roll_pitch_yaw, rotation, rotation_gradient
 from polecal.calib.moments import Moments
@@ -22,9 +23,48 @@ _SAME = 1 - 1e-6
 _TURNS_RAD = (0.0, np.pi / 2, np.pi, -np.pi / 2)
 
 
-def form(pole: Moments, ground: Moments) -> Array:
-    """Give Q (10, 10) with c = hᵀ Q h in m², of moments that `Moments.at` has folded (Eqs. 5, 6, 7)."""
-    return pole.covariance(0) + pole.covariance(1) + ground.covariance(2)
+class Scatter:
+    """The spread of one kind of returns: within each pass, and of the passes' means.
+
+    Takes each pass's moments as `Moments.at` has folded them, and the axes of n whose variance counts
+    (north and east of the pole, Eq. 5; down of the ground, Eq. 6).
+    """
+
+    def __init__(self, passes: Sequence[Moments], axes: Sequence[int]) -> None:
+        self.count = np.array([one.count for one in passes], dtype=np.float64)
+        self._axes = len(axes)
+        self._within = np.stack(
+            [one.count * sum((one.covariance(axis) for axis in axes), np.zeros((10, 10))) for one in passes]
+        )
+        self._mean = np.stack([[one.mean(axis) for axis in axes] for one in passes])  # (P, axes, 10)
+
+    def form(self, used: NDArray[np.bool_], ratio: float = np.inf) -> Array:
+        """Give the quadratic form (10, 10) of the used passes' variance in m².
+
+        ``ratio`` is the variance within a pass over that of the error which all its returns share: a pass
+        of n returns says no more of where its mean should be than n / (1 + n / ratio) independent ones.
+        Infinite: no error is shared, and the form is the variance of Eqs. 5 and 6 to the letter.
+        """
+        total = self.count[used].sum()
+        if not total:
+            return np.zeros((10, 10))
+        weight = self.count[used] / (1.0 + self.count[used] / ratio)
+        mean = self._mean[used]
+        apart = mean - np.tensordot(weight / weight.sum(), mean, axes=1)
+        between = np.einsum("p,pai,paj->ij", weight, apart, apart)
+        form: Array = (self._within[used].sum(axis=0) + between) / total
+        return form
+
+    def ratio(self, vector: Array) -> float:
+        """Estimate that ratio from the passes themselves, at the mount ``vector`` (6,)."""
+        there = self.count > 0
+        h = _h(vector)
+        count, mean = self.count[there], self._mean[there] @ h
+        if len(count) < 2:
+            return np.inf
+        within = float(np.einsum("i,pij,j->", h, self._within[there], h)) / (count.sum() * self._axes)
+        apart = float(mean.var(axis=0, ddof=1).mean()) - within * float((1.0 / count).mean())
+        return within / apart if apart > 0 else np.inf
 
 
 def cost_m(q: Array, vector: Array) -> float:

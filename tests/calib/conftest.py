@@ -1,6 +1,4 @@
-"""A vehicle that drives past a pole, as arrays."""
-
-from collections.abc import Callable
+"""Arrays that a vehicle driving past a pole would give."""
 
 import numpy as np
 import pytest
@@ -42,7 +40,7 @@ def drive(
             ray = np.einsum("pij,bj->pbi", c, direction)
             origin = position + np.einsum("pij,j->pi", c, rb)
             if kind is Kind.GROUND:
-                r = -origin[:, None, 2] / ray[..., 2]
+                r = -origin[:, None, 2] / np.where(ray[..., 2] > 1e-3, ray[..., 2], -1.0)
                 hit = (r > 0) & (r < 30)
             else:
                 u = ray[..., :2] / np.linalg.norm(ray[..., :2], axis=-1, keepdims=True)
@@ -71,6 +69,15 @@ def drive(
     return Returns(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-@pytest.fixture(name="drive")
-def _drive() -> Callable[..., Returns]:
-    return drive
+class Rig:
+    """The simulated rig: `TRUE` is what `drive` was simulated with, unless it is told otherwise."""
+
+    true = TRUE
+    measured = MEASURED
+    drive = staticmethod(drive)
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    """Give the simulated rig."""
+    return Rig()

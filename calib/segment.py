@@ -1,0 +1,122 @@
+"""A scan to pole, ground and neither: by reflectivity first, then by place."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polecal.calib.geometry import Array
+
+Indices = NDArray[np.int64]
+
+RETRO_REFLECTIVE = 0.6
+"""From here on (scale 0 to 1) a return is from retro-reflective tape: level 5 of the LMS's 7."""
+_DULL = 0.3  # up to here it is from soil, grass or walls
+_STEP_M = 0.3  # along one object the range does not jump by more
+_SPREAD_M = 0.03  # beam width and range noise add to what an object looks like
+_SPREAD_BEAMS = 3
+_MARGIN_BEAMS = 2  # next to a reflector a beam sees half of each
+_GROUND_BAND_M = 0.5
+_GROUND_RANGE_M = 30.0
+_MEMORY_SCANS = 200
+_MOST_PLACES = 32
+_WIDE_SHARE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Reflector:
+    """Neighbouring beams of a scan that met one retro-reflective object."""
+
+    beams: Indices
+    range_m: float
+    thin: bool
+    """Whether it looks no wider than the pole would."""
+
+
+def reflectors(
+    range_m: Array, bearing_rad: Array, reflectivity: Array, *, pole_radius_m: float
+) -> list[Reflector]:
+    """Find the retro-reflective objects in a scan.
+
+    Takes (N,) arrays in the order of the beams, NaN where there is no range.
+    """
+    bright = np.flatnonzero((reflectivity >= RETRO_REFLECTIVE) & np.isfinite(range_m))
+    if not len(bright):
+        return []
+    apart = (np.diff(bright) > _MARGIN_BEAMS) | (np.abs(np.diff(range_m[bright])) > _STEP_M)
+    step_rad = abs(float(bearing_rad[1] - bearing_rad[0]))
+    found = []
+    for beams in np.split(bright, np.flatnonzero(apart) + 1):
+        distance_m = float(range_m[beams].mean())
+        width_m = distance_m * (abs(float(bearing_rad[beams[-1]] - bearing_rad[beams[0]])) + step_rad)
+        widest_m = 2 * pole_radius_m + _SPREAD_BEAMS * step_rad * distance_m + _SPREAD_M
+        found.append(Reflector(beams, distance_m, width_m <= widest_m))
+    return found
+
+
+@dataclass(slots=True)
+class _Place:
+    north_east_m: Array
+    sightings: int = 0
+    wide: int = 0
+
+
+class Places:
+    """Where in n reflectors stand: each sighting goes to the nearest place known, or makes a new one."""
+
+    def __init__(self) -> None:
+        self._places: list[_Place] = []
+
+    def sight(self, point_ne_m: Array, gate_m: float, *, thin: bool) -> int | None:
+        """Give the place of a sighting at (2,) north, east; None where there are too many places already."""
+        number = self._nearest(point_ne_m, gate_m)
+        if number is None:
+            if len(self._places) == _MOST_PLACES:
+                return None
+            number = len(self._places)
+            self._places.append(_Place(point_ne_m.astype(np.float64)))
+        place = self._places[number]
+        place.sightings += 1
+        place.wide += not thin
+        place.north_east_m += (point_ne_m - place.north_east_m) / min(place.sightings, _MEMORY_SCANS)
+        return number
+
+    def could_be_pole(self, number: int) -> bool:
+        """Say whether what stands there looks thin from all sides: a plate does so from its edge alone."""
+        place = self._places[number]
+        return place.wide <= _WIDE_SHARE * place.sightings
+
+    def at(self, number: int) -> tuple[float, float]:
+        """Give a place's north and east in m."""
+        north, east = self._places[number].north_east_m
+        return float(north), float(east)
+
+    def _nearest(self, point_ne_m: Array, gate_m: float) -> int | None:
+        if not self._places:
+            return None
+        offsets = np.stack([place.north_east_m for place in self._places]) - point_ne_m
+        distance_m = np.linalg.norm(offsets, axis=1)
+        nearest = int(np.argmin(distance_m))
+        return nearest if distance_m[nearest] <= gate_m else None
+
+
+@dataclass(slots=True)
+class Ground:
+    """The level of the ground in n, from dull returns; and which returns are it."""
+
+    _levels_m: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY_SCANS))
+
+    def beams(self, range_m: Array, reflectivity: Array, down_m: Array) -> Indices:
+        """Find the ground among a scan's (N,) returns, ``down_m`` their z in n; NaN where there is none."""
+        bright = np.flatnonzero(reflectivity > _DULL)
+        edge = (bright[:, None] + np.arange(-_MARGIN_BEAMS, _MARGIN_BEAMS + 1)).ravel()
+        dull = np.isfinite(range_m) & (range_m <= _GROUND_RANGE_M)
+        dull[edge[(edge >= 0) & (edge < len(dull))]] = False
+        if not dull.any():
+            return np.zeros(0, dtype=np.int64)
+        self._levels_m.append(float(np.median(down_m[dull])))
+        level_m = float(np.median(self._levels_m))
+        return np.flatnonzero(dull & (np.abs(down_m - level_m) <= _GROUND_BAND_M))

@@ -1,0 +1,168 @@
+"""One laser's bytes, with the trajectory, to passes of the pole: each beam at its own time and pose."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polecal.calib import Kind, Mount, points_nav
+from polecal.calib.segment import Ground, Places, Reflector, reflectors
+from polecal.daemon.config import Config, Laser
+from polecal.daemon.passes import PassBuilder, StoredPass, observed
+from polecal.daemon.trajectory import Trajectory
+from polecal.drivers.clock import Clock
+from polecal.drivers.port import BITS_PER_BYTE
+from polecal.drivers.sick_lms import REVOLUTION_S, Frame, Framer, Scan, beam_ages_s, bearings_rad, decode
+
+LEVELS_MODE = 0x01  # measuring mode 01: 13 bits of range, 3 of reflectivity (sheet, 3.3)
+
+_REVOLUTION_NS = round(REVOLUTION_S * 1e9)
+_MIRROR_DRIFT = 5e-3  # a motor, not a crystal: 75 Hz is 13.33 ms, the sheet's 148 µs word says 13.32 ms
+_MOST_WAITING = 256  # scans that wait for their poses: 14 s at 18.8 Hz
+_SLOWEST_MPS, _SLOWEST_RADPS = 0.05, 0.02  # a vehicle that stands adds weight and no information
+_GATE_M = (0.5, 2.5)
+
+NO_POSE = "no pose at the beam's time"
+NO_CLOCK = "clocks not settled yet"
+STANDING = "vehicle standing"
+WAITED_TOO_LONG = "poses came too late"
+OTHER_REFLECTOR = "a reflector, but not the pole"
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A scan in which something could be the pole."""
+
+    stx_ns: int  # host time at which its first byte left the laser
+    range_m: NDArray[np.float64]
+    reflectivity: NDArray[np.float64]
+    found: list[Reflector]
+
+
+class LaserChannel:
+    """Takes a laser's chunks, and gives passes as soon as the trajectory has come as far."""
+
+    def __init__(
+        self,
+        laser: Laser,
+        config: Config,
+        trajectory: Trajectory,
+        gps_clock: Clock,
+        on_frame: Callable[[int], None],
+    ) -> None:
+        self.dropped: Counter[str] = Counter()
+        """Beams, or scans of a laser, that were not used, by reason."""
+        self.framer = Framer()
+        self.places = Places()
+        self.measured = Mount(**laser.mount.model_dump())
+        self.mount = self.measured
+        """What places returns in n: the best known so far."""
+        self._builder = PassBuilder(config.routine.slice_deg)
+        self._ground = Ground()
+        self._clock = Clock(max_drift=_MIRROR_DRIFT)
+        self._revolutions: tuple[int, int] | None = None  # the count so far, and its host time
+        self._waiting: deque[_Waiting] = deque()
+        self._seen_ns = 0
+        self._laser, self._pole = laser, config.pole
+        self._trajectory, self._gps_clock = trajectory, gps_clock
+        self._on_frame = on_frame
+        count = round(laser.fov_deg / laser.resolution_deg) + 1
+        self._bearing_rad = bearings_rad(count, laser.fov_deg, laser.resolution_deg)
+        ages_s = beam_ages_s(laser.fov_deg, laser.resolution_deg, count)
+        self._age_ns = np.round(ages_s * 1e9).astype(np.int64)
+        self._byte_ns = BITS_PER_BYTE * 1e9 / laser.baud
+
+    def feed(self, t_ns: int, data: bytes) -> None:
+        """Take a chunk that was read at host time ``t_ns``."""
+        for frame in self.framer.feed(data, t_ns):
+            scan = Scan.parse(frame)
+            if scan is not None and scan.count == len(self._bearing_rad) and scan.partial is None:
+                self._on_frame(frame.t_first_ns)
+                self._take(frame, scan)
+
+    def _take(self, frame: Frame, scan: Scan) -> None:
+        stx_ns = self._stx_ns(frame, scan)
+        self._seen_ns = frame.t_first_ns if stx_ns is None else stx_ns
+        decoded = decode(scan, LEVELS_MODE)
+        found = reflectors(
+            decoded.ranges_m, self._bearing_rad, decoded.reflectivity, pole_radius_m=self._pole.radius_m
+        )
+        if not found:
+            return
+        if stx_ns is None or not self._gps_clock.locked:
+            self.dropped[NO_CLOCK] += scan.count
+            return
+        if len(self._waiting) == _MOST_WAITING:
+            self._waiting.popleft()
+            self.dropped[WAITED_TOO_LONG] += scan.count
+        self._waiting.append(_Waiting(stx_ns, decoded.ranges_m, decoded.reflectivity, found))
+
+    def _stx_ns(self, frame: Frame, scan: Scan) -> int | None:
+        """Give the host time at which the telegram's first byte left, by the mirror's own clock.
+
+        A laser that does not number its revolutions is stamped as its bytes came.
+        """
+        stamp_ns = round(frame.t_first_ns - frame.lead_bytes * self._byte_ns)
+        if scan.scan_index is None:
+            return stamp_ns
+        count, at_ns = self._revolutions or (scan.scan_index, stamp_ns)
+        guess = count + (stamp_ns - at_ns) / _REVOLUTION_NS  # the counter is mod 256: 3.4 s
+        count = scan.scan_index + 256 * round((guess - scan.scan_index) / 256)
+        self._revolutions = count, stamp_ns
+        self._clock.update(count * _REVOLUTION_NS, stamp_ns)
+        return self._clock.to_host(count * _REVOLUTION_NS) if self._clock.locked else None
+
+    def fuse(self) -> list[StoredPass]:
+        """Place the scans whose poses are all there; give the passes that have ended."""
+        while self._waiting:
+            stx_gps_ns = self._gps_clock.to_device(self._waiting[0].stx_ns)
+            if stx_gps_ns - int(self._age_ns.min()) > self._trajectory.last_ns:
+                break
+            self._place(self._waiting.popleft(), stx_gps_ns - self._age_ns)
+        oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns
+        return self._builder.close(oldest_ns)
+
+    def end(self) -> list[StoredPass]:
+        """Close what is open, at the end of a run."""
+        return self._builder.close()
+
+    def _place(self, scan: _Waiting, gps_ns: NDArray[np.int64]) -> None:
+        poses = self._trajectory.at(gps_ns)
+        known = poses.known
+        self.dropped[NO_POSE] += int(np.count_nonzero(~known))
+        if not known.any():
+            return
+        speed = np.linalg.norm(poses.velocity_mps[known], axis=1).mean()
+        turning = np.linalg.norm(poses.rate_radps[known], axis=1).mean()
+        if speed < _SLOWEST_MPS and turning < _SLOWEST_RADPS:
+            self.dropped[STANDING] += int(np.count_nonzero(known))
+            return
+        range_m = np.where(known, scan.range_m, np.nan)
+        kind = np.full(len(range_m), Kind.GROUND, dtype=np.uint8)
+        every = observed(np.nan_to_num(range_m), self._bearing_rad, poses, kind)
+        points = points_nav(every, self.mount)
+        ground = self._ground.beams(range_m, scan.reflectivity, points[:, 2])
+        for reflector in scan.found:
+            beams = reflector.beams[known[reflector.beams]]
+            if not len(beams):
+                continue
+            at_ne_m = points[beams, :2].mean(axis=0)
+            place = self.places.sight(at_ne_m, self._gate_m(reflector.range_m), thin=reflector.thin)
+            if place is None or not reflector.thin or not self.places.could_be_pole(place):
+                self.dropped[OTHER_REFLECTOR] += len(beams)
+                continue
+            used = np.concatenate([beams, ground])
+            kind[beams] = Kind.POLE
+            self._builder.add(place, scan.stx_ns, gps_ns[used], every[used])
+            kind[beams] = Kind.GROUND
+
+    def _gate_m(self, range_m: float) -> float:
+        """How far off the hand measurement may put a sighting."""
+        sigma = self._laser.mount_sigma
+        wide_m = 2 * (sigma.xyz_m + range_m * np.radians(sigma.rpy_deg))
+        return cast(float, min(max(wide_m, _GATE_M[0]), _GATE_M[1]))

@@ -1,0 +1,122 @@
+"""Segmented scans to passes: from the pole's coming into view to its going out of view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polecal.calib import Kind, Pass, Returns
+from polecal.calib.estimate import split
+from polecal.daemon.trajectory import Poses
+
+_OUT_OF_VIEW_NS = 1_500_000_000
+_LONGEST_NS = 60_000_000_000  # bounds what is kept of a vehicle that never turns away
+_FEWEST_POLE_RETURNS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class StoredPass:
+    """A closed pass: its returns with their GPS times, and their moments."""
+
+    id: int
+    place: int
+    t_ns: tuple[int, int]
+    """Host time of its first and last scan, CLOCK_MONOTONIC ns."""
+    gps_ns: NDArray[np.int64]
+    """(N,) GPS time of each return."""
+    returns: Returns
+    moments: Pass
+
+
+@dataclass(slots=True)
+class _Open:
+    first_ns: int
+    last_ns: int
+    parts: list[tuple[NDArray[np.int64], Returns]]
+
+
+class PassBuilder:
+    """Collects returns place by place, and closes a pass once its place has not been seen for a while."""
+
+    def __init__(self, slice_deg: int) -> None:
+        self.too_short = 0
+        self._slice_deg = slice_deg
+        self._open: dict[int, _Open] = {}
+        self._count = 0
+
+    def add(
+        self,
+        place: int,
+        t_ns: int,
+        gps_ns: NDArray[np.int64],
+        returns: Returns,
+    ) -> None:
+        """Add one scan's returns of the reflector at ``place`` and of the ground."""
+        current = self._open.setdefault(place, _Open(t_ns, t_ns, []))
+        current.last_ns = t_ns
+        current.parts.append((gps_ns, returns))
+
+    def close(self, t_ns: int | None = None) -> list[StoredPass]:
+        """Give the passes that have ended by host time ``t_ns``; all that are open if None."""
+        ended = [
+            place
+            for place, one in self._open.items()
+            if t_ns is None or t_ns - one.last_ns > _OUT_OF_VIEW_NS or t_ns - one.first_ns > _LONGEST_NS
+        ]
+        closed = []
+        for place in ended:
+            one = self._open.pop(place)
+            gps_ns = np.concatenate([part[0] for part in one.parts])
+            returns = joined([part[1] for part in one.parts], self._count + 1)
+            if np.count_nonzero(returns.kind == Kind.POLE) < _FEWEST_POLE_RETURNS:
+                self.too_short += 1
+                continue
+            self._count += 1
+            closed.append(
+                StoredPass(
+                    id=self._count,
+                    place=place,
+                    t_ns=(one.first_ns, one.last_ns),
+                    gps_ns=gps_ns,
+                    returns=returns,
+                    moments=Pass(self._count, split(returns, self._slice_deg)),
+                )
+            )
+        return closed
+
+    def counts(self) -> tuple[int, int]:
+        """Give how many passes are open, and how many returns they hold."""
+        return len(self._open), sum(len(part[1]) for one in self._open.values() for part in one.parts)
+
+
+def observed(
+    range_m: NDArray[np.float64], bearing_rad: NDArray[np.float64], poses: Poses, kind: NDArray[np.uint8]
+) -> Returns:
+    """Join ranges, bearings and poses of N beams of one scan to returns (their pass is not known yet)."""
+    return Returns(
+        range_m,
+        bearing_rad,
+        poses.position_m,
+        poses.rpy_rad,
+        kind,
+        np.zeros(len(range_m), dtype=np.int64),
+        poses.velocity_mps,
+        poses.rate_radps,
+    )
+
+
+def joined(parts: list[Returns], pass_id: int) -> Returns:
+    """Put returns of one pass behind one another."""
+    count = sum(map(len, parts))
+    return Returns(
+        np.concatenate([part.range_m for part in parts]),
+        np.concatenate([part.bearing_rad for part in parts]),
+        np.concatenate([part.position_m for part in parts]),
+        np.concatenate([part.rpy_rad for part in parts]),
+        np.concatenate([part.kind for part in parts]),
+        np.full(count, pass_id, dtype=np.int64),
+        np.concatenate([part.velocity_mps for part in parts if part.velocity_mps is not None]),
+        np.concatenate([part.rate_radps for part in parts if part.rate_radps is not None]),
+    )

@@ -1,0 +1,274 @@
+"""Recorded chunks to calibrations: one deterministic function, live and in replay.
+
+What it gives depends on nothing but the configuration and the chunks, in their order.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from polecal.calib import CalibrationError, Pass, Result, estimate
+from polecal.calib.coverage import headings
+from polecal.daemon import results
+from polecal.daemon.config import SPAN, Config, Laser
+from polecal.daemon.fusion import LaserChannel
+from polecal.daemon.passes import StoredPass
+from polecal.daemon.routine import OnTransition, Routine, State
+from polecal.daemon.trajectory import Trajectory
+from polecal.drivers.clock import Clock
+from polecal.drivers.novatel_span import Framer, InsStatus, nav_state
+from polecal.drivers.port import BITS_PER_BYTE
+
+OnPass = Callable[[str, StoredPass], None]
+"""Takes (laser's name, pass) of every pass that is closed."""
+
+_RECEIVER_DRIFT = 200e-6
+_LOST_NS = 2_000_000_000  # without a good pose for so long, it is back to aligning
+_RATE_OVER = 50  # frames
+
+
+class _Pulse:
+    """How often something comes."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._times_ns: deque[int] = deque(maxlen=_RATE_OVER)
+
+    def beat(self, t_ns: int) -> None:
+        self.count += 1
+        self._times_ns.append(t_ns)
+
+    @property
+    def rate_hz(self) -> float:
+        if len(self._times_ns) < 2 or self._times_ns[-1] == self._times_ns[0]:
+            return 0.0
+        return (len(self._times_ns) - 1) * 1e9 / (self._times_ns[-1] - self._times_ns[0])
+
+
+class _LaserRun:
+    """One laser: its channel, the passes it has given, and what they come to."""
+
+    def __init__(self, config: Config, laser: Laser, trajectory: Trajectory, gps_clock: Clock) -> None:
+        self.name = laser.name
+        self.pulse = _Pulse()
+        self.setup = results.setup_of(config, laser)
+        self.channel = LaserChannel(laser, config, trajectory, gps_clock, self.pulse.beat)
+        self.result: Result | None = None
+        self._passes: dict[int, list[Pass]] = {}  # by place
+
+    def take(self, stored: StoredPass) -> None:
+        self._passes.setdefault(stored.place, []).append(stored.moments)
+        self.estimate(everywhere=False)
+
+    def estimate(self, *, everywhere: bool) -> None:
+        """Calibrate on the passes of the pole: the thin reflector seen most evenly from all sides."""
+        could_be = [
+            passes for place, passes in self._passes.items() if self.channel.places.could_be_pole(place)
+        ]
+        if not could_be:
+            return
+        passes = max(could_be, key=self._progress)
+        try:
+            self.result = estimate(passes, self.setup, everywhere=everywhere)
+        except CalibrationError:
+            return
+        self.channel.mount = self.result.mount
+
+    def _progress(self, passes: Iterable[Pass]) -> int:
+        """Give how many pole returns count, of those that each slice needs."""
+        counts: Counter[int] = Counter()
+        for one in passes:
+            counts.update(one.pole_returns)
+        return sum(min(count, self.setup.need.min_pole_returns) for count in counts.values())
+
+
+class Pipeline:
+    """All that happens between the bytes and the verdict.
+
+    ``session`` and ``created`` go into the calibration as they are. ``on_pass`` and ``on_transition`` are
+    called from within `feed`.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        *,
+        session: str = "",
+        created: str = "",
+        on_pass: OnPass | None = None,
+        on_transition: OnTransition | None = None,
+    ) -> None:
+        self.routine = Routine(on_transition)
+        self._session, self._created = session, created
+        self._on_pass = on_pass
+        self._need = config.routine
+        self._byte_ns = BITS_PER_BYTE * 1e9 / config.navigation.baud
+        self._framer = Framer()
+        self._pulse = _Pulse()
+        self._clock = Clock(max_drift=_RECEIVER_DRIFT)
+        self._trajectory = Trajectory(1.0 / config.navigation.rate_hz)
+        self._ins_status: InsStatus | int | None = None
+        self._good_ns = 0
+        self._lasers = {
+            laser.name: _LaserRun(config, laser, self._trajectory, self._clock) for laser in config.lasers
+        }
+
+    def begin(self, t_ns: int) -> None:
+        """Start the run at host time ``t_ns``."""
+        self.routine.to(State.CONNECTING, t_ns, "asked to start")
+
+    def feed(self, device: str, t_ns: int, data: bytes) -> None:
+        """Take a chunk that was read from a device at host time ``t_ns`` (CLOCK_MONOTONIC ns).
+
+        Once the run has ended, nothing changes any more.
+        """
+        if not self.routine.running:
+            return
+        if device == SPAN:
+            self._navigate(t_ns, data)
+        elif device in self._lasers:
+            self._lasers[device].channel.feed(t_ns, data)
+        else:
+            return
+        self._advance(t_ns)
+        for laser in self._lasers.values():
+            for stored in laser.channel.fuse():
+                self._take(laser, stored)
+        self._conclude(t_ns)
+
+    def finish(self, t_ns: int, why: str) -> None:
+        """Calibrate with what there is, and end the run."""
+        if not self.routine.running:
+            return
+        self.routine.to(State.CALIBRATING, t_ns, why)
+        for laser in self._lasers.values():
+            for stored in laser.channel.end():
+                self._take(laser, stored)
+            laser.estimate(everywhere=True)
+        reasons = [
+            f"{laser.name}: {reason}"
+            for laser in self._lasers.values()
+            for reason in self._entry(laser)["verdict"]["reasons"]
+        ]
+        state = State.REJECTED if reasons else State.ACCEPTED
+        self.routine.to(state, t_ns, "; ".join(reasons) or "all criteria are met")
+
+    def status(self) -> dict[str, Any]:
+        """Give the part of STATUS that follows from the data."""
+        return {
+            "state": str(self.routine.state),
+            "lasers": [self._entry(laser) for laser in self._lasers.values()],
+            "next": self._next(),
+            "notes": self._notes(),
+        }
+
+    def device(self, name: str) -> dict[str, Any]:
+        """Give the part of a device's STATUS that follows from its data."""
+        if name == SPAN:
+            return {
+                "rate_hz": round(self._pulse.rate_hz, 2),
+                "ins_status": _named(self._ins_status),
+                "frames": self._framer.frames,
+                "bad_frames": self._framer.bad_frames,
+            }
+        laser = self._lasers[name]
+        return {
+            "rate_hz": round(laser.pulse.rate_hz, 2),
+            "frames": laser.channel.framer.frames,
+            "bad_frames": laser.channel.framer.bad_frames,
+        }
+
+    def calibration(self) -> dict[str, Any] | None:
+        """Give the content of ``calibration.yaml``, None before there is a result for every laser."""
+        lasers = []
+        for laser in self._lasers.values():
+            if laser.result is None:
+                return None
+            lasers.append(
+                results.calibration(laser.name, laser.setup, laser.result, self._session, self._created)
+            )
+        return {"state": str(self.routine.state), "lasers": lasers}
+
+    def _navigate(self, t_ns: int, data: bytes) -> None:
+        for frame in self._framer.feed(data, t_ns):
+            nav = nav_state(frame)
+            if nav is None:
+                continue
+            self._pulse.beat(frame.t_first_ns)
+            self._ins_status = nav.ins_status
+            if nav.ins_status is not InsStatus.INS_SOLUTION_GOOD:
+                continue
+            self._clock.update(nav.gps_ns, round(frame.t_first_ns - frame.lead_bytes * self._byte_ns))
+            self._good_ns = t_ns
+            self._trajectory.add(nav)
+
+    def _advance(self, t_ns: int) -> None:
+        state = self.routine.state
+        if (
+            state is State.CONNECTING
+            and self._pulse.count
+            and all(laser.pulse.count for laser in self._lasers.values())
+        ):
+            self.routine.to(State.ALIGNING, t_ns, "all devices stream")
+        elif state is State.ALIGNING and self._good_ns and self._clock.locked and not self._lost(t_ns):
+            self.routine.to(State.COLLECTING, t_ns, "the navigation solution is good")
+        elif state is State.COLLECTING and self._lost(t_ns):
+            why = f"no good navigation solution for 2 s ({_named(self._ins_status)})"
+            self.routine.to(State.ALIGNING, t_ns, why)
+
+    def _lost(self, t_ns: int) -> bool:
+        return t_ns - self._good_ns > _LOST_NS
+
+    def _take(self, laser: _LaserRun, stored: StoredPass) -> None:
+        if self._on_pass is not None:
+            self._on_pass(laser.name, stored)
+        laser.take(stored)
+
+    def _conclude(self, t_ns: int) -> None:
+        if self.routine.state is not State.COLLECTING:
+            return
+        verdicts = [laser.result.verdict for laser in self._lasers.values() if laser.result is not None]
+        if len(verdicts) == len(self._lasers) and all(verdict.accepted for verdict in verdicts):
+            self.finish(t_ns, "the criteria are met")
+        elif any(verdict.hopeless for verdict in verdicts):
+            self.finish(t_ns, "more of the same driving would not help")
+
+    def _entry(self, laser: _LaserRun) -> dict[str, Any]:
+        dropped = {reason: count for reason, count in laser.channel.dropped.items() if count}
+        return results.entry(laser.name, laser.setup, laser.result) | {"dropped": dropped}
+
+    def _next(self) -> str:
+        match self.routine.state:
+            case State.CONNECTING:
+                return "wait: not all devices stream yet"
+            case State.ALIGNING:
+                return "drive until the navigation has aligned: straight, briskly, with a few turns"
+            case State.COLLECTING:
+                missing = {
+                    part["slice"]
+                    for laser in self._lasers.values()
+                    for part in results.entry(laser.name, laser.setup, laser.result)["coverage"]
+                    if not part["done"]
+                }
+                if missing:
+                    return f"drive past the pole heading {headings(sorted(missing), self._need.slice_deg)}"
+                return "drive more passes of the pole, from all sides"
+            case _:
+                return ""
+
+    def _notes(self) -> list[str]:
+        notes = []
+        if self.routine.state is State.ALIGNING:
+            if self._ins_status is not InsStatus.INS_SOLUTION_GOOD:
+                notes.append(f"navigation says {_named(self._ins_status)}: nothing is used before it is good")
+            elif not self._clock.locked:
+                notes.append("the receiver's clock is being learnt")
+        return notes
+
+
+def _named(status: InsStatus | int | None) -> str | None:
+    if status is None or isinstance(status, InsStatus):
+        return None if status is None else status.name
+    return f"unknown ({status})"

@@ -1,0 +1,79 @@
+"""A capture to what its run gave, or would have given with another configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from polecal.daemon import config as configuration
+from polecal.daemon import recorder
+from polecal.daemon.pipeline import Pipeline
+from polecal.daemon.routine import State
+from polecal.daemon.sessions import Session
+
+BEGIN, FINISH = "begin", "finish"
+"""Events that are inputs of the pipeline, and so part of a replay."""
+
+_PROGRESS_EVERY = 500  # records
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a replay came to; ``result`` is the content of calibration.yaml, None without a pass."""
+
+    result: dict[str, Any] | None
+    status: dict[str, Any]
+    out: Path
+    cut: str | None
+    accepted: bool
+
+
+def replay(
+    capture: Path,
+    config: Path | None,
+    out: Path | None,
+    progress: Callable[[float], None] | None,
+) -> Outcome:
+    """Play a capture through the pipeline; calibration and passes go to ``out``.
+
+    ``config`` is a configuration file, else the capture's own is used; ``out`` is a folder beside the
+    capture if None. ``progress`` is told the part done, 0 to 1. A capture that was cut off is used as far
+    as it goes, and what there is then is calibrated.
+
+    Raises RecorderError, ConfigError, SessionError.
+    """
+    source = recorder.read(capture)
+    recorded = source.metadata
+    settings = configuration.load(config) if config else configuration.loads(recorded["config"], str(capture))
+    out = out or capture.parent / "replay"
+    session = Session(out, recorded["created"])
+    (out / "passes").mkdir(parents=True, exist_ok=True)
+    pipeline = Pipeline(
+        settings, session=recorded["session"], created=recorded["created"], on_pass=session.write_pass
+    )
+    last_ns = 0
+    for number, record in enumerate(source):
+        last_ns = record.t_ns
+        if isinstance(record, recorder.Record):
+            if record.direction == "rx":
+                pipeline.feed(record.device, record.t_ns, record.data)
+        elif record.content.get("event") == BEGIN:
+            pipeline.begin(record.t_ns)
+        elif record.content.get("event") == FINISH:
+            pipeline.finish(record.t_ns, record.content["why"])
+        if progress is not None and number % _PROGRESS_EVERY == 0:
+            progress(source.used_bytes / source.size_bytes)
+    pipeline.finish(last_ns, "the capture ends here")
+    result = pipeline.calibration()
+    if result is not None:
+        session.write_calibration(result)
+    if progress is not None:
+        progress(1.0)
+    accepted = pipeline.routine.state is State.ACCEPTED
+    devices = [
+        pipeline.device(name) for name in (*(laser.name for laser in settings.lasers), configuration.SPAN)
+    ]
+    status = {"class": "STATUS", "session": recorded["session"], "devices": devices} | pipeline.status()
+    return Outcome(result, status, out, source.cut, accepted)

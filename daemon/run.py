@@ -1,0 +1,235 @@
+"""One calibration run: device threads to one thread that records each chunk and then feeds the pipeline."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import structlog
+
+from polecal import PolecalError
+from polecal.daemon.config import SPAN, Config
+from polecal.daemon.passes import StoredPass
+from polecal.daemon.pipeline import Pipeline
+from polecal.daemon.recorder import Recorder, RecorderError
+from polecal.daemon.replay import BEGIN, FINISH
+from polecal.daemon.routine import ENDED, State
+from polecal.daemon.sessions import Session, SessionError
+from polecal.drivers.device import Device
+from polecal.drivers.errors import DeviceError, DeviceProtocolError
+from polecal.drivers.novatel_span import NovatelSpan
+from polecal.drivers.port import Direction, Port, Tap
+from polecal.drivers.sick_lms import SickLms
+
+_QUEUED_CHUNKS = 50_000  # minutes of both devices: a disk that stalls for longer stalls the readers
+_SYNC_S = 1.0
+
+_Item = tuple[str, Direction, int, bytes]
+
+
+class Run:
+    """A run from its start to its end; `status` and `stop` may be called from any thread."""
+
+    def __init__(self, config: Config, session: Session) -> None:
+        self.session = session
+        self.ended = threading.Event()
+        """Set once the devices are left, the capture is closed and the result is written."""
+        self._log = structlog.get_logger().bind(session=session.id)
+        self._lock = threading.Lock()
+        self._queue: queue.Queue[_Item | str] = queue.Queue(_QUEUED_CHUNKS)
+        self._problem: PolecalError | None = None
+        self._pipeline = Pipeline(
+            config,
+            session=session.id,
+            created=session.created,
+            on_pass=self._store,
+            on_transition=self._on_transition,
+        )
+        self._recorder = Recorder(session.capture, session.metadata(config))
+        self._devices: list[Device] = [
+            *(
+                SickLms(
+                    laser.name,
+                    laser.port,
+                    laser.baud,
+                    self._tap(laser.name),
+                    fov_deg=laser.fov_deg,
+                    resolution_deg=laser.resolution_deg,
+                    reflectivity=laser.reflectivity,
+                )
+                for laser in config.lasers
+            ),
+            NovatelSpan(
+                SPAN,
+                config.navigation.port,
+                config.navigation.baud,
+                self._tap(SPAN),
+                rate_hz=config.navigation.rate_hz,
+            ),
+        ]
+        self._stops = [threading.Event() for _ in self._devices]
+        self._leaving = False
+        self._threads: list[threading.Thread] = []
+        self._engine = threading.Thread(target=self._work, name="engine")
+
+    @property
+    def devices(self) -> Sequence[Device]:
+        """The devices, lasers first."""
+        return self._devices
+
+    @property
+    def state(self) -> State:
+        """Where the routine is."""
+        return self._pipeline.routine.state
+
+    def begin(self) -> None:
+        """Open every port and start. Raises DeviceError with each port that could not be opened."""
+        ports: list[Port] = []
+        problems: list[DeviceError] = []
+        for device, stop in zip(self._devices, self._stops, strict=True):
+            try:
+                ports.append(device.open(stop))
+            except DeviceError as error:
+                problems.append(error)
+        if problems:
+            for port in ports:
+                port.close()
+            self._recorder.close()
+            self.ended.set()
+            raise joined(problems)
+        now_ns = time.monotonic_ns()
+        self._recorder.event(now_ns, {"event": BEGIN})
+        with self._lock:
+            self._pipeline.begin(now_ns)
+        for device, port in zip(self._devices, ports, strict=True):
+            self._threads.append(threading.Thread(target=device.run, args=(port,), name=device.name))
+        for thread in (*self._threads, self._engine):
+            thread.start()
+
+    def stop(self, why: str, *, calibrate: bool) -> None:
+        """End the run, with or without calibrating what there is; returns once all is closed."""
+        if calibrate:
+            self._queue.put(why)
+        else:
+            self._leave()
+        self.ended.wait()
+
+    def status(self) -> dict[str, Any]:
+        """Give the parts of STATUS that a run knows."""
+        with self._lock:
+            status = self._pipeline.status()
+            since_ns = self._pipeline.routine.since_ns
+            devices = [self._device(device) for device in self._devices]
+        if self._problem is not None:
+            status["state"] = str(State.FAULT)
+            status["notes"] = [str(self._problem), *status["notes"]]
+        since_s = round((time.monotonic_ns() - since_ns) / 1e9, 1)
+        return status | {"session": self.session.id, "since_s": since_s, "devices": devices}
+
+    def result(self) -> dict[str, Any] | None:
+        """Give the calibration as it stands, also before the end."""
+        with self._lock:
+            return self._pipeline.calibration()
+
+    def _device(self, device: Device) -> dict[str, Any]:
+        problem = device.problem
+        return {
+            "name": device.name,
+            "kind": device.kind,
+            "port": device.path,
+            "state": device.state,
+            "identity": device.identity,
+            **self._pipeline.device(device.name),
+            "reconnects": device.reconnects,
+            **({"problem": str(problem), "hint": problem.hint} if problem is not None else {}),
+        }
+
+    def _tap(self, name: str) -> Tap:
+        def tap(direction: Direction, t_ns: int, data: bytes) -> None:
+            self._queue.put((name, direction, t_ns, data))
+
+        return tap
+
+    def _work(self) -> None:
+        """Record, then parse, until every device is left and nothing waits."""
+        synced_s = time.monotonic()
+        while any(thread.is_alive() for thread in self._threads) or not self._queue.empty():
+            try:
+                item = self._queue.get(timeout=_SYNC_S)
+            except queue.Empty:
+                item = None
+            try:
+                if item is not None:
+                    self._take(item)
+                if time.monotonic() - synced_s >= _SYNC_S:
+                    self._recorder.sync()
+                    synced_s = time.monotonic()
+            except PolecalError as error:
+                self._fail(error)
+            if self.state in ENDED:
+                self._leave()
+        self._close()
+
+    def _take(self, item: _Item | str) -> None:
+        if isinstance(item, str):
+            now_ns = time.monotonic_ns()
+            self._recorder.event(now_ns, {"event": FINISH, "why": item})
+            with self._lock:
+                self._pipeline.finish(now_ns, item)
+            return
+        name, direction, t_ns, data = item
+        self._recorder.write(name, direction, t_ns, data)
+        if direction == "rx":
+            with self._lock:
+                self._pipeline.feed(name, t_ns, data)
+
+    def _store(self, laser: str, stored: StoredPass) -> None:
+        self._recorder.sync()
+        self.session.write_pass(laser, stored)
+        self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
+
+    def _on_transition(self, t_ns: int, old: State, new: State, why: str) -> None:
+        self._log.info("state", old=str(old), new=str(new), why=why)
+        self._recorder.event(t_ns, {"event": "state", "old": old, "new": new, "why": why})
+
+    def _fail(self, error: PolecalError) -> None:
+        if self._problem is None:
+            self._log.error("run failed", problem=str(error), hint=error.hint)
+            self._problem = error
+        self._leave()
+
+    def _leave(self) -> None:
+        """Tell the devices to leave; once, as a device that says goodbye clears the flag meanwhile."""
+        with self._lock:
+            leaving, self._leaving = self._leaving, True
+        if not leaving:
+            for stop in self._stops:
+                stop.set()
+
+    def _close(self) -> None:
+        try:
+            calibration = self.result()
+            if self.state in (State.ACCEPTED, State.REJECTED) and calibration is not None:
+                self.session.write_calibration(calibration)
+            self._recorder.close()
+        except (RecorderError, SessionError) as error:
+            self._fail(error)
+        self.ended.set()
+
+
+def joined(problems: Sequence[DeviceError]) -> DeviceError:
+    """Make one error of several, of the first one's class."""
+    if len(problems) == 1:
+        return problems[0]
+    hints = dict.fromkeys(problem.hint for problem in problems)
+    return type(problems[0])("; ".join(map(str, problems)), "; ".join(hints))
+
+
+def silent(device: Device) -> DeviceError:
+    """Make an error of a device that does not stream and does not say why."""
+    return DeviceProtocolError(
+        f"{device.name} on {device.path}: does not stream yet", "check its power and cable, then start again"
+    )

@@ -1,0 +1,176 @@
+"""The daemon: what the control socket is asked, to runs of a calibration."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from typing import Any
+
+import structlog
+
+from polecal import PolecalError, __version__
+from polecal.daemon import log, sessions
+from polecal.daemon.config import SPAN, Config, load
+from polecal.daemon.control import Code, ControlServer, Refused, code_of
+from polecal.daemon.recorder import RecorderError
+from polecal.daemon.routine import State
+from polecal.daemon.run import Run, joined, silent
+
+_START_S = 120.0  # every rate of every device tried twice, and an EEPROM written
+_LOOK_S = 0.1
+
+
+class Service:
+    """Answers the control protocol; holds at most one run."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._run: Run | None = None
+        self._starting = threading.Lock()
+
+    def handle(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Answer one request. Raises Refused and other PolecalErrors."""
+        match request.get("class"):
+            case "START":
+                return self._start(request.get("name"), force=bool(request.get("force", False)))
+            case "STATUS":
+                return self._status()
+            case "STOP":
+                return self._stop(calibrate=bool(request.get("calibrate", False)))
+            case "RESULT":
+                return self._result(request.get("session"))
+            case other:
+                raise Refused(
+                    f"{other!r} is not a request that this daemon knows", "see README.md", Code.USAGE
+                )
+
+    def close(self) -> None:
+        """End what runs, and leave the devices polite."""
+        if self._run is not None:
+            self._run.stop("the daemon is stopped", calibrate=False)
+
+    def _start(self, name: str | None, *, force: bool) -> dict[str, Any]:
+        if not self._starting.acquire(blocking=False):
+            raise Refused(
+                "a session is being started already", "wait for it, or see `polecal-field status`", Code.BUSY
+            )
+        try:
+            current = self._run
+            if current is not None and not current.ended.is_set():
+                if not force:
+                    raise Refused(
+                        f"session {current.session.id} is running",
+                        "stop it by `polecal-field stop`, or start with --force",
+                        Code.BUSY,
+                    )
+                current.stop("another session was started", calibrate=False)
+            run = Run(self._config, sessions.create(self._config.state_dir, self._config, name))
+            run.begin()
+            self._run = run
+            self._await_streams(run)
+        finally:
+            self._starting.release()
+        return {"class": "STARTED", "session": run.session.id, "devices": run.status()["devices"]}
+
+    def _await_streams(self, run: Run) -> None:
+        """Wait until every device streams. Raises DeviceError with what each that does not is missing."""
+        deadline_s = time.monotonic() + _START_S
+        while time.monotonic() < deadline_s and not run.ended.wait(_LOOK_S):
+            if all(device.state == "streaming" for device in run.devices):
+                return
+            if all(device.state == "streaming" or device.problem is not None for device in run.devices):
+                break
+        missing = [device for device in run.devices if device.state != "streaming"]
+        if not missing:
+            return
+        problem = joined([device.problem or silent(device) for device in missing])
+        run.stop("not all devices stream", calibrate=False)
+        raise problem
+
+    def _status(self) -> dict[str, Any]:
+        if self._run is not None:
+            return {"class": "STATUS"} | self._run.status()
+        devices = [
+            {"name": laser.name, "kind": "sick_lms", "port": laser.port, "state": "closed"}
+            for laser in self._config.lasers
+        ]
+        devices.append(
+            {"name": SPAN, "kind": "novatel_span", "port": self._config.navigation.port, "state": "closed"}
+        )
+        return {
+            "class": "STATUS",
+            "state": str(State.IDLE),
+            "session": None,
+            "since_s": 0.0,
+            "devices": devices,
+            "lasers": [],
+            "next": "polecal-field start",
+            "notes": [],
+        }
+
+    def _stop(self, *, calibrate: bool) -> dict[str, Any]:
+        if self._run is None or self._run.ended.is_set():
+            raise Refused("no session is running", "start one by `polecal-field start`", Code.USAGE)
+        self._run.stop("asked to stop", calibrate=calibrate)
+        return {"class": "STOPPED", "session": self._run.session.id, "state": str(self._run.state)}
+
+    def _result(self, session: str | None) -> dict[str, Any]:
+        return {"class": "RESULT"} | sessions.calibration_of(self._config.state_dir, session)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run ``polecald``; give its exit code."""
+    parser = argparse.ArgumentParser(prog="polecald", description=__doc__)
+    parser.add_argument("--config", required=True, help="the configuration, YAML")
+    parser.add_argument("--check-config", action="store_true", help="only say whether it can be used")
+    parser.add_argument("--version", action="version", version=__version__)
+    arguments = parser.parse_args(argv)
+    try:
+        config = load(arguments.config)
+        if arguments.check_config:
+            return 0
+        log.configure()
+        return _serve(config)
+    except PolecalError as error:
+        print(
+            f"polecald: {error}", *([f"hint: {error.hint}"] if error.hint else []), sep="\n", file=sys.stderr
+        )  # noqa: T201
+        return code_of(error)
+
+
+def _serve(config: Config) -> int:
+    stopped = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.set())
+    for folder in (config.state_dir, config.runtime_dir):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecorderError(
+                f"{folder}: cannot be made: {error.strerror}", "make it, or let systemd start polecal"
+            ) from error
+    service = Service(config)
+    with ControlServer(config.socket, service):
+        structlog.get_logger().info("ready", socket=str(config.socket), release=__version__)
+        _notify("READY=1")
+        stopped.wait()
+        _notify("STOPPING=1")
+        service.close()
+    return 0
+
+
+def _notify(state: str) -> None:
+    """Tell systemd, where it listens (sd_notify(3))."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if address:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+            notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,137 @@
+"""Calibration runs as folders: what each was told, its capture, its passes, its calibration."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import yaml
+
+from polecal import PolecalError, __version__
+from polecal.daemon.config import Config, dump
+from polecal.daemon.passes import StoredPass
+
+CAPTURE = "capture.mcap"
+CALIBRATION = "calibration.yaml"
+
+
+class SessionError(PolecalError):
+    """A session's folder that cannot be made, written or found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One calibration run's folder."""
+
+    folder: Path
+    created: str
+    """UTC, ISO 8601."""
+
+    @property
+    def id(self) -> str:
+        """The folder's name."""
+        return self.folder.name
+
+    @property
+    def capture(self) -> Path:
+        """Where its capture is."""
+        return self.folder / CAPTURE
+
+    def metadata(self, config: Config) -> dict[str, str]:
+        """Give what a replay must know; it is in the capture, too, so that one file is enough."""
+        return {
+            "session": self.id,
+            "created": self.created,
+            "polecal": __version__,
+            "config": dump(config),
+        }
+
+    def write_pass(self, laser: str, stored: StoredPass) -> None:
+        """Write a closed pass. Raises SessionError."""
+        returns = stored.returns
+        blocks = stored.moments.blocks
+        with _whole_file(self.folder / "passes" / f"{laser}-{stored.id:03d}.npz") as file:
+            np.savez_compressed(
+                file,
+                t_ns=np.array(stored.t_ns),
+                place=np.array(stored.place),
+                gps_ns=stored.gps_ns,
+                range_m=returns.range_m,
+                bearing_rad=returns.bearing_rad,
+                position_m=returns.position_m,
+                rpy_rad=returns.rpy_rad,
+                kind=returns.kind,
+                velocity_mps=np.asarray(returns.velocity_mps),
+                rate_radps=np.asarray(returns.rate_radps),
+                block_slice_kind=np.array([(part, int(kind)) for part, kind in blocks]),
+                block_count=np.array([block.count for block in blocks.values()]),
+                block_first=np.stack([block.first for block in blocks.values()]),
+                block_second=np.stack([block.second for block in blocks.values()]),
+            )
+
+    def write_calibration(self, calibration: dict[str, Any]) -> Path:
+        """Write ``calibration.yaml``; give its path. Raises SessionError."""
+        path = self.folder / CALIBRATION
+        with _whole_file(path) as file:
+            file.write(yaml.safe_dump(calibration, sort_keys=False, allow_unicode=True).encode())
+        return path
+
+
+def create(state_dir: Path, config: Config, name: str | None) -> Session:
+    """Make a new session's folder. Raises SessionError."""
+    now = datetime.now(UTC)
+    label = name or "-".join(laser.name for laser in config.lasers)
+    folder = state_dir / "sessions" / f"{now:%Y%m%dT%H%M%SZ}-{label}"
+    try:
+        (folder / "passes").mkdir(parents=True)
+    except OSError as error:
+        raise SessionError(
+            f"{folder}: cannot be made: {error.strerror}",
+            "see that state_dir is there, has room, and that this user may write to it",
+        ) from error
+    session = Session(folder, now.isoformat(timespec="seconds"))
+    with _whole_file(folder / "session.yaml") as file:
+        file.write(yaml.safe_dump(session.metadata(config), sort_keys=False).encode())
+    return session
+
+
+def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
+    """Read a session's calibration; the last accepted one's if none is named. Raises SessionError."""
+    folder = state_dir / "sessions"
+    names = sorted((path.name for path in folder.glob("*/") if (path / CALIBRATION).is_file()), reverse=True)
+    if session is not None:
+        names = [name for name in names if name == session]
+    for name in names:
+        content: dict[str, Any] = yaml.safe_load((folder / name / CALIBRATION).read_text(encoding="utf-8"))
+        if session is not None or content["state"] == "accepted":
+            return content
+    wanted = f"session {session} has no calibration" if session else "no session was accepted yet"
+    raise SessionError(wanted, "see `polecal-field status` for what is still to be driven")
+
+
+@contextmanager
+def _whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """Write a file that is there as a whole or not at all, also after a power cut. Raises SessionError."""
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.rename(path)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise SessionError(
+            f"{path}: cannot be written: {error.strerror}", "make room on the disk, then start again"
+        ) from error

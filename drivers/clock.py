@@ -1,0 +1,107 @@
+"""A device's clock to the host's monotonic clock, from stamps that are late but never early.
+
+What a device sends is stamped with its own clock and arrives after a delay that varies and is never
+negative. So the line below all points (device time, host time) is the clock, up to the smallest delay
+(Zhang, Liu, Xia, "Clock synchronization algorithms for network measurements", 2002: the lower convex hull).
+Of the hull the edge over the middle of the window is taken, which minimises the points' mean distance. An
+oscillator wanders, so a window that slides is needed: two hulls that start half a window apart, the older
+one in use (as ethz-asl/cuckoo_time_translator switches).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_JUMP_NS = 500_000_000  # no line delay: one of the two clocks was set, or the device started again
+_EARLY_NS = 50_000_000  # nothing arrives before it was sent
+
+
+@dataclass(slots=True)
+class _Hull:
+    """The lower convex hull of points, left to right."""
+
+    x: list[int]
+    y: list[int]
+
+    def add(self, x: int, y: int) -> None:
+        while len(self.x) > 1:
+            x1, y1, x2, y2 = self.x[-2], self.y[-2], self.x[-1], self.y[-1]
+            if (y2 - y1) * (x - x2) < (y - y2) * (x2 - x1):
+                break
+            self.x.pop()
+            self.y.pop()
+        self.x.append(x)
+        self.y.append(y)
+
+    def slope(self) -> float:
+        """Give the slope of the edge over the middle."""
+        middle = (self.x[0] + self.x[-1]) / 2
+        for index in range(1, len(self.x)):
+            if self.x[index] >= middle:
+                return (self.y[index] - self.y[index - 1]) / (self.x[index] - self.x[index - 1])
+        return 0.0
+
+
+class Clock:
+    """Maps a device's time to host time and back: one way, on line, in bounded memory, deterministic.
+
+    Device time is in ns of the device's nominal clock; the host's is CLOCK_MONOTONIC ns. ``max_drift`` is
+    by how much of itself the device's rate may differ from nominal; ``settle_s`` how long a stretch of
+    stamps is needed before the map is `locked`.
+    """
+
+    def __init__(self, *, max_drift: float, window_s: float = 60.0, settle_s: float = 3.0) -> None:
+        self.resets = 0
+        self._max_drift = max_drift
+        self._half_ns = int(window_s * 1e9 / 2)
+        self._settle_ns = int(settle_s * 1e9)
+        self._clear()
+
+    def _clear(self) -> None:
+        self._device0_ns = self._host0_ns = 0
+        self._old: _Hull | None = None
+        self._young: _Hull | None = None
+        self._first_ns = 0
+        self._slope = self._offset_ns = 0.0
+        self._last_ns = 0
+
+    @property
+    def locked(self) -> bool:
+        """Whether enough has been heard to trust the map."""
+        return self._old is not None and self._last_ns - self._first_ns >= self._settle_ns
+
+    def update(self, device_ns: int, host_ns: int) -> None:
+        """Take one stamp, sent at ``device_ns`` and arrived at ``host_ns``; a jump of either starts anew."""
+        if self._old is not None:
+            late_ns = host_ns - self.to_host(device_ns)
+            if device_ns <= self._last_ns + self._device0_ns:
+                if device_ns == self._last_ns + self._device0_ns:
+                    return
+                late_ns = _JUMP_NS + 1  # time went back
+            if late_ns > _JUMP_NS or (late_ns < -_EARLY_NS and self.locked):
+                self.resets += 1
+                self._clear()
+        if self._old is None or self._young is None:
+            self._device0_ns, self._host0_ns = device_ns, host_ns
+            self._old, self._young = _Hull([], []), _Hull([], [])
+        x = device_ns - self._device0_ns
+        y = host_ns - self._host0_ns - x
+        self._last_ns = x
+        if x - self._first_ns >= 2 * self._half_ns and self._young.x:
+            self._old, self._young = self._young, _Hull([], [])
+            self._first_ns = self._old.x[0]
+        self._old.add(x, y)
+        if x - self._first_ns >= self._half_ns:
+            self._young.add(x, y)
+        self._slope = max(-self._max_drift, min(self._max_drift, self._old.slope()))
+        self._offset_ns = min(yi - self._slope * xi for xi, yi in zip(self._old.x, self._old.y, strict=True))
+
+    def to_host(self, device_ns: float) -> int:
+        """Give the host's time at a device time, ns."""
+        x = device_ns - self._device0_ns
+        return self._host0_ns + round(x + self._offset_ns + self._slope * x)
+
+    def to_device(self, host_ns: float) -> int:
+        """Give the device's time at a host time, ns."""
+        t = host_ns - self._host0_ns - self._offset_ns
+        return self._device0_ns + round(t / (1.0 + self._slope))

@@ -1,0 +1,152 @@
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from polecal.calib import CalibrationError, Criteria, Kind, Mount, Need, Returns, calibrate, cost
+from polecal.calib.observations import PARAMETERS
+
+
+def errors(found, true):
+    return np.abs(np.array(astuple(found)) - astuple(true))
+
+
+def test_without_noise_the_true_mount_is_found_exactly(rig):
+    exact = rig.drive(passes=12)
+    result = calibrate(exact, rig.measured)
+    assert errors(result.mount, rig.true).max() < 5e-3
+    assert result.cost_m < 1e-3
+    assert result.measured_cost_m > 10 * result.cost_m
+
+
+def test_pole_of_a_radius_is_calibrated_without_bias_only_when_it_is_told(rig):
+    returns = rig.drive(noise_m=0.01, nav_m=0.012, radius_m=0.06, seed=5)
+    with_radius = calibrate(returns, rig.measured, pole_radius_m=0.06)
+    without = calibrate(returns, rig.measured)
+    assert abs(with_radius.mount.x_m - rig.true.x_m) < 0.012
+    assert abs(without.mount.x_m - rig.true.x_m) > 0.025
+
+
+def test_result_is_the_minimum_that_sqp_on_the_cloud_finds(rig):
+    """The paper's way: SQP, the cloud recomputed at every evaluation; noise and all."""
+    returns = rig.drive(noise_m=0.02, nav_m=0.02, passes=12, seed=2)
+    anything = Mount(9, 9, 9, 900, 900, 900)
+    result = calibrate(
+        returns, rig.measured, measured_sigma=anything, criteria=Criteria(max_sigma=(9.0,) * 6)
+    )
+    scale = np.array([1, 1, 1, 10, 10, 10.0])
+
+    def of(values):
+        return 1e3 * cost(returns, Mount(*(values * scale))) ** 2
+
+    start = np.add(astuple(result.mount), [0.01, -0.01, 0.01, 0.3, 0.2, -0.3])
+    slsqp = minimize(of, start / scale, method="SLSQP", options={"ftol": 1e-13, "maxiter": 300})
+    assert result.cost_m <= np.sqrt(slsqp.fun / 1e3) + 1e-9
+    assert result.cost_m == pytest.approx(cost(returns, result.mount), abs=1e-12)
+
+
+def test_errors_stay_within_three_claimed_sigma(rig):
+    worst = []
+    for seed in range(6):
+        returns = rig.drive(noise_m=0.01, nav_m=0.012, radius_m=0.04, seed=seed)
+        result = calibrate(returns, rig.measured, pole_radius_m=0.04)
+        worst.append((errors(result.mount, rig.true) / astuple(result.sigma)).max())
+    assert np.median(worst) < 3.0
+
+
+def test_on_a_flat_pad_z_is_held_as_measured_and_said_to_be(rig):
+    returns = rig.drive(noise_m=0.01, nav_m=0.012, tilt_deg=0.1, seed=3)
+    result = calibrate(returns, rig.measured)
+    assert "z" in result.held
+    assert result.mount.z_m == rig.measured.z_m
+    assert result.sigma.z_m == pytest.approx(0.1), "what is held is as good as the tape"
+    assert result.covariance[2, 2] == pytest.approx(0.01)
+
+
+def test_a_level_sensor_has_roll_and_pitch_held(rig):
+    level = Mount(0.0, -0.3, -1.0, 0.0, 0.0, 2.0)
+    returns = rig.drive(mount=level, noise_m=0.01, nav_m=0.01, tilt_deg=0.0)
+    returns = returns[returns.kind == Kind.POLE]
+    result = calibrate(returns, replace(level, yaw_deg=0.0))
+    assert {"roll", "pitch"} <= set(result.held)
+    assert result.mount.yaw_deg == pytest.approx(2.0, abs=0.15)
+
+
+def test_what_is_asked_to_be_held_stays(rig):
+    result = calibrate(rig.drive(passes=12), rig.measured, hold=["roll", "x"])
+    assert result.mount.roll_deg == rig.measured.roll_deg
+    assert result.mount.x_m == rig.measured.x_m
+    assert {"x", "roll"} <= set(result.held)
+
+
+def test_a_mount_that_is_half_a_turn_off_is_found_all_the_same(rig):
+    wrong = replace(rig.measured, yaw_deg=180.0)
+    result = calibrate(rig.drive(noise_m=0.005, passes=12), wrong)
+    assert errors(result.mount, rig.true)[3:].max() < 0.3
+    assert any("from the hand measurement" in reason for reason in result.verdict.reasons)
+    assert not result.verdict.accepted
+
+
+def test_the_same_rotation_is_never_shown_by_its_other_three_angles(rig):
+    for seed in range(4):
+        result = calibrate(rig.drive(noise_m=0.01, nav_m=0.01, tilt_deg=0.2, seed=seed), rig.measured)
+        assert abs(result.mount.roll_deg) < 10
+
+
+def test_verdict_names_slices_without_a_pass(rig):
+    returns = rig.drive(passes=12, noise_m=0.01)
+    seen = returns[~np.isin(returns.pass_id, (3, 4))]
+    result = calibrate(seen, rig.measured, need=Need(min_pole_returns=20))
+    assert not result.verdict.accepted
+    assert any("slices 3, 4 have no pass" in reason for reason in result.verdict.reasons)
+    assert not result.verdict.hopeless
+
+
+def test_verdict_accepts_a_good_drive_and_gives_up_on_a_hopeless_one(rig):
+    good = calibrate(rig.drive(noise_m=0.01, nav_m=0.012), rig.measured, need=Need(min_pole_returns=20))
+    assert good.verdict.accepted
+    assert good.verdict.reasons == ()
+    bad = calibrate(
+        rig.drive(noise_m=0.01, nav_m=0.2),
+        rig.measured,
+        need=Need(min_pole_returns=20),
+        criteria=Criteria(improvement=0.5),
+    )
+    assert not bad.verdict.accepted
+    assert bad.verdict.hopeless
+    assert any("cost" in reason for reason in bad.verdict.reasons)
+
+
+def test_either_criterion_is_enough_where_any_is_asked_for(rig):
+    drive = rig.drive(noise_m=0.05, nav_m=0.05)
+    loose = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1)
+    criteria = Criteria(cost_m=0.001, improvement=0.9, mode="any", max_sigma=loose)
+    assert calibrate(drive, rig.measured, criteria=criteria, need=Need(min_pole_returns=20)).verdict.accepted
+    strict = replace(criteria, mode="all")
+    verdict = calibrate(drive, rig.measured, criteria=strict, need=Need(min_pole_returns=20)).verdict
+    assert not verdict.accepted
+
+
+def test_too_little_is_refused_with_what_to_do(rig):
+    drive = rig.drive(passes=12)
+    with pytest.raises(CalibrationError, match="pole returns are too few") as caught:
+        calibrate(drive[drive.kind == Kind.GROUND], rig.measured)
+    assert "tape" in caught.value.hint
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    one, three = np.ones(2), np.ones((2, 3))
+    kind, number = np.zeros(2, np.uint8), np.zeros(2, np.int64)
+    with pytest.raises(CalibrationError, match="rpy_rad has shape"):
+        Returns(one, one, three, one, kind, number)
+    with pytest.raises(CalibrationError, match="range_m holds"):
+        Returns(one * np.nan, one, three, three, kind, number)
+
+
+def test_covariance_is_in_the_order_of_the_parameters(rig):
+    result = calibrate(rig.drive(noise_m=0.01, nav_m=0.01), rig.measured)
+    sigma = np.sqrt(np.diag(result.covariance))
+    assert sigma[0] == pytest.approx(result.sigma.x_m)
+    assert np.degrees(sigma[5]) == pytest.approx(result.sigma.yaw_deg)
+    assert PARAMETERS == ("x", "y", "z", "roll", "pitch", "yaw")

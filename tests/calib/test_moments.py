@@ -1,0 +1,69 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polecal.calib import Kind, Mount, cost, points_nav
+from polecal.calib import moments as m
+from polecal.calib.geometry import rotation
+from polecal.calib.solve import Scatter, cost_m
+
+
+@pytest.fixture(scope="module")
+def returns(rig):
+    return rig.drive(noise_m=0.01, nav_m=0.01, passes=8)
+
+
+def form(pole, ground):
+    """Eq. 7 of one pass."""
+    every = np.array([True])
+    return Scatter([pole], (0, 1)).form(every) + Scatter([ground], (2,)).form(every)
+
+
+def split(returns):
+    pole = returns.kind == Kind.POLE
+    return m.of(returns[pole]), m.of(returns[~pole])
+
+
+@pytest.mark.parametrize("mount", [Mount(0, -0.35, -1, 0, -8, 0), Mount(0.3, 0.1, -1.2, 4, -11, 170)])
+@pytest.mark.parametrize("radius_m", [0.0, 0.05])
+def test_cost_from_moments_is_the_cost_of_the_cloud(returns, mount, radius_m):
+    pole, ground = split(returns)
+    q = form(pole.at(np.pi / 4 * radius_m, 0.0), ground.at(0.0, 0.0))
+    assert cost_m(q, mount.vector) == pytest.approx(cost(returns, mount, radius_m), rel=1e-9)
+
+
+def test_moments_of_parts_add_up_and_come_off_again(returns):
+    first, rest = returns[:1000], returns[1000:]
+    whole = m.of(returns)
+    together = m.of(first) + m.of(rest)
+    np.testing.assert_allclose(together.second, whole.second, rtol=1e-12, atol=1e-6)
+    left = whole - m.of(rest)
+    assert left.count == 1000
+    np.testing.assert_allclose(left.first, m.of(first).first, rtol=1e-9, atol=1e-6)
+
+
+def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):
+    """The derivative carried in the moments against poses that really are a little later."""
+    n, tau = len(returns), 1e-4
+    rng = np.random.default_rng(1)
+    velocity, rate = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    moving = replace(returns, velocity_mps=velocity, rate_radps=rate)
+    pole, ground = split(moving)
+    told = cost_m(form(pole.at(0.0, tau), ground.at(0.0, tau)), rig.true.vector)
+    body = np.einsum(
+        "nij,nj->ni",
+        rotation(returns.rpy_rad).transpose(0, 2, 1),
+        points_nav(returns, rig.true) - returns.position_m,
+    )
+    later = points_nav(returns, rig.true) + tau * (
+        velocity + np.einsum("nij,nj->ni", rotation(returns.rpy_rad), np.cross(rate, body))
+    )
+    on_pole = returns.kind == Kind.POLE
+    variance = later[on_pole, :2].var(axis=0).sum() + later[~on_pole, 2].var()
+    assert told == pytest.approx(np.sqrt(variance), rel=1e-9)
+
+
+def test_no_returns_cost_nothing():
+    assert m.zero().count == 0
+    assert not m.zero().at(0.0, 0.0).covariance(0).any()

@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from polecal.calib.segment import Ground, Places, reflectors
+
+BEARING = np.radians(50 - 0.25 * np.arange(401))
+
+
+def scan(*objects):
+    """Dull soil at 8 m, and (first beam, beams, range, reflectivity) in front of it."""
+    ranges, reflectivity = np.full(401, 8.0), np.zeros(401)
+    for first, count, range_m, level in objects:
+        ranges[first : first + count] = range_m
+        reflectivity[first : first + count] = level
+    return ranges, BEARING, reflectivity
+
+
+def found(*objects, radius_m=0.04):
+    return reflectors(*scan(*objects), pole_radius_m=radius_m)
+
+
+def test_bright_beams_as_narrow_as_the_pole_are_a_reflector():
+    (pole,) = found((100, 5, 4.0, 1.0))
+    assert pole.beams.tolist() == [100, 101, 102, 103, 104]
+    assert pole.range_m == pytest.approx(4.0)
+    assert pole.thin
+
+
+def test_what_is_wider_than_the_pole_is_not_it():
+    assert [one.thin for one in found((100, 18, 4.0, 1.0))] == [False]
+
+
+def test_dull_things_are_no_reflectors():
+    assert found((100, 5, 4.0, 0.3)) == []
+    assert found() == []
+
+
+def test_two_reflectors_side_by_side_at_different_ranges_are_two():
+    assert [one.range_m for one in found((100, 3, 4.0, 1.0), (103, 3, 6.0, 1.0))] == pytest.approx([4.0, 6.0])
+
+
+def test_beams_without_a_range_are_passed_over():
+    ranges, bearing, reflectivity = scan((100, 5, np.nan, 1.0))
+    assert reflectors(ranges, bearing, reflectivity, pole_radius_m=0.04) == []
+
+
+def test_sightings_go_to_the_nearest_place_or_make_one():
+    places = Places()
+    assert places.sight(np.array([3.0, 1.0]), 1.0, thin=True) == 0
+    assert places.sight(np.array([9.0, 1.0]), 1.0, thin=True) == 1
+    assert places.sight(np.array([3.4, 1.2]), 1.0, thin=True) == 0
+    assert places.at(0) == pytest.approx((3.2, 1.1))
+
+
+def test_a_plate_that_is_thin_from_its_edge_alone_could_not_be_the_pole():
+    places = Places()
+    for number in range(100):
+        places.sight(np.array([0.0, 0.0]), 1.0, thin=True)
+        places.sight(np.array([5.0, 0.0]), 1.0, thin=number % 4 == 0)
+    assert places.could_be_pole(0)
+    assert not places.could_be_pole(1)
+
+
+def test_places_are_bounded():
+    places = Places()
+    numbers = [places.sight(np.array([10.0 * k, 0.0]), 1.0, thin=True) for k in range(40)]
+    assert numbers[31] == 31
+    assert numbers[32:] == [None] * 8
+
+
+def test_ground_is_dull_near_its_level_and_not_beside_a_reflector():
+    ranges, _, reflectivity = scan((100, 5, 4.0, 1.0))
+    down = np.full(401, 0.02)
+    down[200:210] = -1.4  # a fence
+    ranges[300] = np.nan
+    beams = set(Ground().beams(ranges, reflectivity, down).tolist())
+    assert beams == set(range(401)) - set(range(98, 107)) - set(range(200, 210)) - {300}
+
+
+def test_a_scan_of_nothing_has_no_ground():
+    assert not len(Ground().beams(np.full(9, np.nan), np.zeros(9), np.full(9, np.nan)))
