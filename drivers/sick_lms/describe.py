@@ -135,7 +135,9 @@ class Describer:
         if isinstance(telegram, Status):
             self.measuring_mode = telegram.measuring_mode
             self.fov_deg, self.resolution_deg = telegram.fov_deg, telegram.resolution_cdeg / 100
-        elif isinstance(telegram, ConfigurationRead | ConfigurationWritten):
+        elif isinstance(telegram, ConfigurationRead) or (
+            isinstance(telegram, ConfigurationWritten) and telegram.accepted
+        ):
             self.measuring_mode = telegram.configuration.measuring_mode
         elif isinstance(telegram, VariantSwitched):
             self.fov_deg, self.resolution_deg = telegram.fov_deg, telegram.resolution_cdeg / 100
@@ -147,20 +149,20 @@ class Describer:
             "count": scan.count,
             "unit_m": scan.unit_m,
             "measuring_mode": f"{self.measuring_mode:02X}",
-            "fov_deg": self.fov_deg,
-            "resolution_deg": self.resolution_deg,
             "partial": scan.partial,
             "scan_index": scan.scan_index,
             "telegram_index": scan.telegram_index,
             "status": f"{scan.status:02X}",
             "ranges_m": [None if math.isnan(r) else round(r, 3) for r in ranges_m.tolist()],
             "no_range": {
-                kind.name.lower(): n for kind in NoRange if kind and (n := int((kinds == kind).sum()))
+                NoRange(kind).name.lower(): kinds.count(kind) for kind in sorted(set(kinds)) if kind
             },
             "reflectivity": [None if math.isnan(r) else round(r, 6) for r in reflectivity.tolist()],
         }
-        for bit, name in enumerate(MEASURING_MODES[self.measuring_mode].flags):
+        for bit, name in enumerate(() if scan.energy is not None else self._flags()):
             described[name] = [bool(flag >> bit & 1) for flag in flags.tolist()]
+        if self.fov_deg and self.resolution_deg and self.fov_deg == (scan.count - 1) * self.resolution_deg:
+            described |= {"fov_deg": self.fov_deg, "resolution_deg": self.resolution_deg}
         if scan.energy is not None:
             described["energy"] = scan.energy.tolist()
         if scan.spans:
@@ -168,6 +170,9 @@ class Describer:
         if scan.mean_of is not None:
             described["mean_of"] = scan.mean_of
         return described
+
+    def _flags(self) -> tuple[str, ...]:
+        return MEASURING_MODES[self.measuring_mode].flags
 
 
 def _meaning(code: int) -> str:

@@ -161,11 +161,15 @@ class Framer:
         end = self._end(at)
         if end is None:
             return "length", at + _AROUND
-        behind = self._held.find(_ACK_STX, at + 1, end)
+        limit, ack = min(end, size), 0  # of those behind an ACK, the one that was whole first counts
+        behind = self._held.find(_ACK_STX, at + 1, limit)
         while behind >= 0:
-            if self._whole(behind + 1, min(end, size)):
-                return "cut off", behind
-            behind = self._held.find(_ACK_STX, behind + 1, end)
+            whole = self._whole(behind + 1, limit)
+            if whole is not None:
+                limit, ack = whole - 1, behind
+            behind = self._held.find(_ACK_STX, behind + 1, limit)
+        if ack:
+            return "cut off", ack
         if end > size:
             return ("cut off", size) if final else (None, end)
         return (None, end) if self._checked(at, end) else ("crc", end)
@@ -177,19 +181,19 @@ class Framer:
         length = self._held[at + 2] | self._held[at + 3] << 8
         return at + _AROUND + length if 1 <= length <= MAX_TELEGRAM_BYTES - _AROUND else None
 
-    def _whole(self, at: int, limit: int) -> bool:
-        """Whether a reply begins at ``at`` that is whole and right and ends by ``limit``."""
+    def _whole(self, at: int, limit: int) -> int | None:
+        """Where the reply at ``at`` ends, if it is right and ends by ``limit``."""
         if at + 4 > limit or not self._held[at + 1] & REPLY:
-            return False
+            return None
         end = self._end(at)
         if end is None or end > limit:
-            return False
+            return None
         offset = self._start + at
         if offset not in self._verdicts:
             if len(self._verdicts) > MAX_TELEGRAM_BYTES:
                 self._verdicts.clear()
             self._verdicts[offset] = self._checked(at, end)
-        return self._verdicts[offset]
+        return end if self._verdicts[offset] else None
 
     def _checked(self, at: int, end: int) -> bool:
         return crc16(self._held, at, end - 2) == self._held[end - 2] | self._held[end - 1] << 8
