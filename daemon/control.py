@@ -98,7 +98,7 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _error(error: PolecalError) -> Message:
+def as_message(error: PolecalError) -> Message:
     return {"class": "ERROR", "code": code_of(error), "message": str(error), "hint": error.hint}
 
 
@@ -138,7 +138,7 @@ class _Lines:
         """Send an object. Raises OSError."""
         line = encode(message)
         if len(line) > MAX_LINE_BYTES:
-            line = encode(_error(Refused(f"the reply has {len(line)} bytes, too many")))
+            line = encode(as_message(Refused(f"the reply has {len(line)} bytes, too many")))
         self.socket.sendall(line)
 
 
@@ -242,7 +242,7 @@ class ControlServer:
             if full:
                 with contextlib.suppress(OSError), connection:
                     _Lines(connection, MAX_LINE_BYTES).write(
-                        _error(Refused(f"{_MAX_CLIENTS} clients are connected already", code=Code.BUSY))
+                        as_message(Refused(f"{_MAX_CLIENTS} clients are connected already", code=Code.BUSY))
                     )
             else:
                 thread.start()
@@ -262,7 +262,7 @@ class ControlServer:
                         break
                     request = _parse(line)
                 except Refused as error:
-                    lines.write(_error(error))
+                    lines.write(as_message(error))
                     continue
                 if request["class"] == "WATCH":
                     self._watch(lines, log)
@@ -290,11 +290,11 @@ class ControlServer:
             encode(reply)
         except PolecalError as error:
             level("refused", request=request["class"], problem=str(error), code=code_of(error))
-            return _error(error)
+            return as_message(error)
         except Exception as error:
             log.exception("a request failed", request=request)
             hint = "its log has more (`journalctl -u polecal`): please report it"
-            return _error(Refused(f"polecald failed at it: {error!r}", hint))
+            return as_message(Refused(f"polecald failed at it: {error!r}", hint))
         return reply
 
 

@@ -1,0 +1,346 @@
+"""The operator's command, ``polecal-field``: each verb to the daemon, or to a file, and back in words."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from enum import Enum
+from pathlib import Path
+from typing import IO, Any, NoReturn
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from polecal import PolecalError, __version__
+from polecal.daemon import control
+from polecal.daemon.control import Client, Code, Refused
+from polecal.daemon.routine import State
+from polecal.daemon.screen import Screen
+
+# The verbs that calculate or decode import what they need themselves: numpy takes longer than a status.
+
+_SOCKET = "/run/polecal/control.sock"
+_STATUS_S = 1.0
+_ANSWER_S = 10.0
+_START_S = 300.0  # a device search tries every rate, twice, and may write an EEPROM
+_STOP_S = 120.0  # the devices are left polite, and what there is may be calibrated
+_POLL_S = 0.5
+_DECODE_BYTES = 4096
+_EXIT_BY_STATE = {State.ACCEPTED: 0, State.REJECTED: Code.REJECTED, State.FAULT: Code.DEVICE}
+_WORKING = (State.CONNECTING, State.ALIGNING, State.COLLECTING)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run ``polecal-field``; give its exit code."""
+    arguments = _parser().parse_args(argv)
+    try:
+        return int(arguments.run(arguments))
+    except PolecalError as error:
+        if arguments.json:
+            _print_json(control.as_message(error))
+        _complain(str(error), error.hint)
+        return control.code_of(error)
+    except BrokenPipeError:  # whoever read has enough; what Python flushes at its exit must not fail too
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except KeyboardInterrupt:
+        return 130
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        _complain(message, f"see `{self.prog} --help`")
+        sys.exit(Code.USAGE)
+
+
+def _parser() -> argparse.ArgumentParser:
+    shared = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    shared.add_argument("--socket", type=Path, metavar="PATH", help=f"the daemon's, else {_SOCKET}")
+    shared.add_argument("--json", action="store_true", help="print what the daemon says, as it is")
+    parser = _Parser(
+        prog="polecal-field", description="Calibrate a laser's pose in the field.", parents=[shared]
+    )
+    parser.set_defaults(socket=Path(os.environ.get("POLECAL_SOCKET") or _SOCKET), json=False)
+    parser.add_argument("--version", action="version", version=__version__)
+    verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
+
+    def verb(run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
+        name = run.__name__.strip("_")
+        made = verbs.add_parser(name, parents=[shared], help=about, description=about.capitalize() + ".")
+        made.set_defaults(run=run)
+        return made
+
+    start = verb(_start, "begin a session; returns once every device streams")
+    start.add_argument("--name", help="goes into the session's name")
+    start.add_argument("--force", action="store_true", help="also where a session is running, which ends")
+    status = verb(_status, "show how it stands and what to drive next")
+    status.add_argument("--watch", action="store_true", help="go on showing it, until Ctrl-C")
+    wait = verb(_wait, "wait until the calibration is accepted or rejected")
+    wait.add_argument("--for", dest="state", choices=[str(state) for state in State], help="until this state")
+    wait.add_argument("--timeout", type=float, metavar="S", help="give up after so many seconds")
+    stop = verb(_stop, "end the session")
+    stop.add_argument("--calibrate", action="store_true", help="calibrate with what there is")
+    result = verb(_result, "print a calibration, by default the last accepted one")
+    result.add_argument("session", nargs="?", metavar="SESSION")
+    result.add_argument("--format", choices=["yaml", "json"], default="yaml")
+    replay = verb(_replay, "run a capture through the whole pipeline again, without a daemon")
+    replay.add_argument("capture", type=Path, metavar="CAPTURE")
+    replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
+    replay.add_argument("--out", type=Path, metavar="DIR", help="where calibration and passes go")
+    decode = verb(_decode, "print a raw byte file as JSON lines, one a frame")
+    decode.add_argument("file", metavar="FILE", help="- for standard input")
+    decode.add_argument("--as", dest="kind", choices=["sick_lms", "novatel_span"], required=True)
+    emulate = verb(_emulate, "run an emulated laser and receiver on pseudo-terminals")
+    emulate.add_argument("--lms-link", type=Path, metavar="PATH", help="name the laser's terminal so")
+    emulate.add_argument("--span-link", type=Path, metavar="PATH", help="name the receiver's terminal so")
+    emulate.add_argument("--seed", type=int, default=1, metavar="N", help="which drive in which world")
+    emulate.add_argument("--seconds", type=float, metavar="S", help="end after so long")
+    demo = verb(_demo, "calibrate emulated devices with a real daemon; found against true")
+    demo.add_argument("--out", type=Path, metavar="DIR", help="where all of it goes")
+    demo.add_argument("--seed", type=int, default=1, metavar="N", help="which drive in which world")
+    return parser
+
+
+def _start(arguments: argparse.Namespace) -> int:
+    request = {"class": "START", "name": arguments.name, "force": arguments.force}
+    answers: list[dict[str, Any] | PolecalError] = []
+
+    def ask() -> None:
+        try:
+            answers.append(client.request(request))
+        except PolecalError as error:
+            answers.append(error)
+
+    with Client(arguments.socket, _START_S) as client, Client(arguments.socket, _STATUS_S) as looking:
+        asking = threading.Thread(target=ask, daemon=True)  # so that Ctrl-C need not wait for it
+        asking.start()
+        said: dict[str, str] = {}
+        while asking.is_alive():
+            asking.join(_POLL_S)
+            if asking.is_alive():
+                _say_waiting(looking, said)
+    answer = answers[0]
+    if isinstance(answer, PolecalError):
+        raise answer
+    if arguments.json:
+        _print_json(answer)
+        return 0
+    print(f"session {answer.get('session')} has started")
+    for device in answer.get("devices") or []:
+        print(
+            f"  {device.get('name')}: {device.get('state')} on {device.get('port')}", _about(device), sep=""
+        )
+    return 0
+
+
+def _say_waiting(client: Client, said: dict[str, str]) -> None:
+    """Tell on stderr what each device is doing, if it is something new."""
+    with contextlib.suppress(Refused):
+        for device in client.request({"class": "STATUS"}).get("devices") or []:
+            name, state = device.get("name"), device.get("state")
+            told = device.get("problem") or f"{state} on {device.get('port')}"
+            if said.get(name) != told and state != "closed":
+                said[name] = told
+                print(f"  {name}: {told} ...", file=sys.stderr)
+
+
+def _about(device: dict[str, Any]) -> str:
+    identity = device.get("identity")
+    return f": {identity}" if identity else ""
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    with Client(arguments.socket, _STATUS_S) as client:
+        if not arguments.watch:
+            status = client.request({"class": "STATUS"})
+            _show(status, arguments)
+            return _health(status)
+        client.patience(_ANSWER_S)
+        code = 0
+        live = Live(console=Console(), auto_refresh=False, screen=True)
+        redrawn = sys.stdout.isatty() and not arguments.json
+        with live if redrawn else contextlib.nullcontext(), contextlib.suppress(KeyboardInterrupt):
+            for status in client.watch():
+                code = _health(status)
+                if redrawn:
+                    live.update(Screen(status), refresh=True)
+                else:
+                    _show(status, arguments)
+                    sys.stdout.flush()
+        if redrawn:
+            Console().print(Screen(status))
+        return code
+
+
+def _health(status: dict[str, Any]) -> int:
+    """Give 1 for a fault, or for a device that should stream and does not."""
+    devices = status.get("devices") or []
+    silent = any(device.get("state") != "streaming" for device in devices)
+    state = status.get("state")
+    return Code.DEGRADED if state == State.FAULT or (state in _WORKING and silent) else 0
+
+
+def _wait(arguments: argparse.Namespace) -> int:
+    deadline_s = time.monotonic() + (float("inf") if arguments.timeout is None else arguments.timeout)
+    wanted = arguments.state
+    last = None
+    with Client(arguments.socket, _ANSWER_S) as client:
+        while True:
+            status = client.request({"class": "STATUS"})
+            state = status.get("state")
+            if last not in (None, state) and not arguments.json:
+                print(f"  {state}", file=sys.stderr)
+            last = state
+            if state == wanted or (wanted is None and state in _EXIT_BY_STATE):
+                _show(status, arguments)
+                return 0 if wanted else _EXIT_BY_STATE[state]
+            if state in _EXIT_BY_STATE:
+                _complain(f"it ended {state}, and will not be {wanted}", "see `polecal-field status`")
+                return _EXIT_BY_STATE[state] or Code.DEGRADED
+            if state == State.IDLE and wanted is None:
+                raise Refused("no session is running", "start one by `polecal-field start`", Code.USAGE)
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                _complain(f"still {state} after {arguments.timeout:g} s", "see `polecal-field status`")
+                return Code.DEGRADED
+            time.sleep(min(_POLL_S, left_s))
+
+
+def _stop(arguments: argparse.Namespace) -> int:
+    with Client(arguments.socket, _STOP_S) as client:
+        answer = client.request({"class": "STOP", "calibrate": arguments.calibrate})
+    if arguments.json:
+        _print_json(answer)
+    else:
+        print(f"session {answer.get('session')} has ended: {answer.get('state')}")
+    return _EXIT_BY_STATE.get(answer.get("state"), 0) if arguments.calibrate else 0
+
+
+def _result(arguments: argparse.Namespace) -> int:
+    with Client(arguments.socket, _ANSWER_S) as client:
+        answer = client.request({"class": "RESULT", "session": arguments.session})
+    content = {key: value for key, value in answer.items() if key != "class"}
+    if arguments.json:
+        _print_json(answer)
+    elif arguments.format == "json":
+        print(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        import yaml  # noqa: PLC0415
+
+        print(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), end="")
+    if content.get("state") == State.REJECTED:
+        _complain("this calibration was rejected", "see the reasons in its verdict; do not use it")
+        return Code.REJECTED
+    return 0
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from polecal.daemon.recorder import RecorderError  # noqa: PLC0415
+    from polecal.daemon.replay import replay  # noqa: PLC0415
+
+    try:
+        with _progress() as progress:
+            outcome = replay(arguments.capture, arguments.config, arguments.out, progress)
+    except RecorderError as error:
+        raise Refused(str(error), error.hint, Code.USAGE) from error
+    _show(outcome.status, arguments)
+    if outcome.cut:
+        _complain(f"warning: {outcome.cut}", "what is above comes from that part")
+    if not arguments.json:
+        print(f"calibration and passes: {outcome.out}" if outcome.result else "no pass, so no calibration")
+    return 0 if outcome.accepted else Code.REJECTED
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[float], None] | None]:
+    """Draw a bar on stderr, if that is a terminal, for what is told the part done."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    columns = (TextColumn("replay"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("replay", total=1.0)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def _decode(arguments: argparse.Namespace) -> int:
+    if arguments.kind == "sick_lms":
+        from polecal.drivers import sick_lms as driver  # noqa: PLC0415
+    else:
+        from polecal.drivers import novatel_span as driver  # type: ignore[no-redef]  # noqa: PLC0415
+    skips: list[Any] = []
+    framer: Any = driver.Framer(on_skip=skips.append)
+    describer: Any = driver.Describer()
+    number = 0
+
+    def put(frames: list[Any]) -> None:
+        nonlocal number
+        for item in sorted([*frames, *skips], key=lambda each: each.offset):
+            where = {"offset": item.offset, "length": len(item.data)}
+            if isinstance(item, driver.Frame):
+                _print_json({"frame": number, **where, **describer.describe(item)})
+                number += 1
+            else:
+                reason = item.reason.value if isinstance(item.reason, Enum) else item.reason
+                _print_json({"frame": None, "name": "garbage", **where, "reason": reason})
+        skips.clear()
+
+    with _opened(arguments.file) as stream:
+        while data := stream.read(_DECODE_BYTES):
+            put(framer.feed(data, 0))
+    put(framer.close() or [])
+    sys.stdout.flush()
+    return 0
+
+
+@contextlib.contextmanager
+def _opened(name: str) -> Iterator[IO[bytes]]:
+    if name == "-":
+        yield sys.stdin.buffer
+        return
+    try:
+        stream = Path(name).open("rb")  # noqa: SIM115
+    except OSError as error:
+        raise Refused(f"{name}: cannot be read: {error.strerror}", "name a file", Code.USAGE) from error
+    with stream:
+        yield stream
+
+
+def _emulate(arguments: argparse.Namespace) -> int:
+    from polecal.drivers.emulated.serve import run_emulate  # noqa: PLC0415
+
+    return run_emulate(arguments.lms_link, arguments.span_link, arguments.seed, arguments.seconds)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from polecal.daemon.demo import demo  # noqa: PLC0415
+
+    return demo(arguments.out or Path(tempfile.mkdtemp(prefix="polecal-demo-")), arguments.seed)
+
+
+def _show(status: dict[str, Any], arguments: argparse.Namespace) -> None:
+    if arguments.json:
+        _print_json(status)
+    else:
+        Console().print(Screen(status))
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    print(control.encode(content).decode(), end="")
+
+
+def _complain(what: str, hint: str) -> None:
+    print(f"polecal-field: {what}", *([f"hint: {hint}"] if hint else []), sep="\n", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
