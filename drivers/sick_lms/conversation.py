@@ -45,7 +45,7 @@ class Conversation:
     def _begin(self) -> None:
         self.framer = Framer(self._skipped)
         self.heard = b""
-        self._acked = self._refused_crc = False
+        self._acked = self._refused_crc = self._garbled = self._quiet = False
 
     def set_baud(self, baud: int) -> None:
         """Go on at another rate of the host. Raises DeviceError."""
@@ -63,8 +63,8 @@ class Conversation:
     ) -> R:
         """Send ``request`` until ``reply`` comes, and return it; other telegrams are passed over.
 
-        It is sent again after ``ack_s`` without an ACK, after ``within_s`` from an ACK without the reply,
-        and after a NAK. Raises NoReply, NotAllowed, Stopped, DeviceLost.
+        It is sent again after ``ack_s`` without an ACK, after ``within_s`` from an ACK without the reply or
+        sooner if that came broken, and after a NAK. Raises NoReply, NotAllowed, Stopped, DeviceLost.
         """
         for attempt in range(tries):
             self._send(request)
@@ -86,7 +86,7 @@ class Conversation:
 
     def _send(self, request: Telegram) -> None:
         self.framer.close()  # a telegram that is under way is cut off by the request
-        self._acked = self._refused_crc = False
+        self._acked = self._refused_crc = self._garbled = False
         self.port.write(request.build())
 
     def _await(self, request: Telegram, code: int, ack_s: float, within_s: float) -> Frame | None:
@@ -102,6 +102,8 @@ class Conversation:
                         "it is in another mode, or of a type that lacks this: switch it off and on, "
                         "then compare its type with the configuration",
                     )
+            if self._garbled and self._quiet:
+                return None
             if self._refused_crc and not self._acked:
                 self.pause(_AFTER_NAK_S)
                 return None
@@ -112,11 +114,13 @@ class Conversation:
 
     def _hear(self, timeout_s: float) -> list[Frame]:
         chunk = self.port.read(timeout_s)
+        self._quiet = chunk is None
         if chunk is None:
             return self.framer.close() if timeout_s >= _QUIET_S else []
         self.heard = (self.heard + chunk.data)[-_HEARD_BYTES:]
         return self.framer.feed(chunk.data, chunk.t_ns)
 
     def _skipped(self, skip: Skip) -> None:
+        self._garbled |= self._acked and skip.reason not in ("ack", "nak")
         self._acked |= skip.reason == "ack"
         self._refused_crc |= skip.reason == "nak"
