@@ -292,7 +292,7 @@ def _clear_of(drive: Drive, pole: tuple[float, float]) -> Reflector:
     """Return a plate that faces the pole from 5 to 7 m, where the vehicle keeps furthest from it."""
     distance, bearing = (
         grid.ravel()
-        for grid in np.meshgrid(np.linspace(5, 7, 11), np.linspace(0, 2 * np.pi, 180, endpoint=False))
+        for grid in np.meshgrid(np.linspace(5.2, 6.8, 9), np.linspace(0, 2 * np.pi, 180, endpoint=False))
     )
     places = np.column_stack([pole[0] + distance * np.cos(bearing), pole[1] + distance * np.sin(bearing)])
     away = np.min(np.linalg.norm(places[:, None] - drive.path(), axis=2), axis=1)
