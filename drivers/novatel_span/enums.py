@@ -7,6 +7,9 @@ from typing import TypeVar
 
 E = TypeVar("E", bound=IntEnum)
 
+NAMELESS = -1
+"""Stands for a word in an ASCII log that the sheet does not have; never a value on the wire."""
+
 
 def named(kind: type[E], value: int) -> E | int:
     """Return the member of ``kind`` with that value, or the number itself where the sheet has no name."""
@@ -245,15 +248,31 @@ class Datum(IntEnum):
 
 
 class Component(IntEnum):
-    """Parts that VERSION lists (sheet 2.2)."""
+    """Parts that VERSION lists (sheet 2.2, and the makers' message table)."""
 
     UNKNOWN = 0
     GPSCARD = 1
     CONTROLLER = 2
     ENCLOSURE = 3
+    IBOARD = 4
+    L5_FPGA = 5
     IMUCARD = 7
     USERINFO = 8
+    OEM6FPGA = 12
+    GPSCARD2 = 13
+    BLUETOOTH = 14
+    WIFI = 15
+    CELLULAR = 16
+    EXTENSION = 17
+    RADIO = 18
+    WWW_CONTENT = 19
+    REGULATORY = 20
     OEM7FPGA = 21
+    APPLICATION = 22
+    PACKAGE = 23
+    DEFAULT_CONFIG = 25
+    WHEELSENSOR = 26
+    EMBEDDED_AUTH = 27
 
 
 class Trigger(IntEnum):
@@ -347,6 +366,23 @@ class AlignmentMode(IntEnum):
     AUTOMATIC = 3
     STATIC = 4
     KINEMATIC = 5
+
+
+class RelativeOutput(IntEnum):
+    """The frame of relative INS output (INSCONFIG)."""
+
+    INVALID = 0
+    ROVER = 1
+    MASTER = 2
+    ECEF = 3
+    LOCALLEVEL = 4
+
+
+class Switch(IntEnum):
+    """A yes or no."""
+
+    FALSE = 0
+    TRUE = 1
 
 
 class InsOffset(IntEnum):

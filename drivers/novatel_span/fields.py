@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar, dataclass_transform, get_args, get_t
 
 import numpy as np
 
-from polecal.drivers.novatel_span.enums import MessageId, named
+from polecal.drivers.novatel_span.enums import NAMELESS, MessageId, named
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class _Field:
     def from_raw(self, raw: tuple[Any, ...]) -> Any:
         assert self.wire is not None
         if self.wire.code.endswith("s"):
-            return raw[0].rstrip(b"\0").decode("ascii", "replace")
+            return raw[0].partition(b"\0")[0].decode("latin-1")  # as its ASCII twin prints it
         if self.wire.enum:
             return named(self.wire.enum, raw[0])
         return raw[0] if self.values == 1 else raw
@@ -77,7 +77,9 @@ class _Field:
         wire = self.wire
         assert wire is not None
         if wire.enum:
-            return named(wire.enum, int(token)) if token.isdecimal() else wire.enum[token]
+            if token.isdecimal():
+                return named(wire.enum, int(token))
+            return wire.enum.__members__.get(token, NAMELESS)
         kind = wire.code[-1]
         if kind == "s":
             return token
@@ -132,7 +134,7 @@ class Layout:
         return self.cls(*values), at
 
     def scan(self, tokens: Iterator[str]) -> Any:
-        """Read one object from ASCII fields. Raises ValueError, KeyError, StopIteration on a bad line."""
+        """Read one object from ASCII fields. Raises ValueError, StopIteration on a bad line."""
         values = []
         for f in self.fields:
             if f.wire:

@@ -105,7 +105,7 @@ class Frame:
             number = named(MessageId, int.from_bytes(self.data[4:6], "little"))
             return number.name if isinstance(number, MessageId) else f"MESSAGE_{number}"
         if self.kind in _ASCII_KINDS:
-            return self._ascii_header[0][:-1]  # its last letter: A a log, R a response
+            return self._ascii_name[0]
         if self.kind is Kind.ABBREVIATED:
             return self.text.removeprefix("<").partition(" ")[0] or None
         return None
@@ -158,7 +158,7 @@ class Frame:
         """Whether it answers a binary or ASCII command, rather than being a log."""
         if self.kind is Kind.BINARY:
             return bool(self.data[6] & RESPONSE_BIT)
-        return self.kind is Kind.ASCII and self._ascii_header[0].endswith("R")
+        return self.kind is Kind.ASCII and self._ascii_name[1] == "R"
 
     @property
     def body(self) -> bytes:
@@ -189,8 +189,14 @@ class Frame:
         if self.kind is Kind.BINARY:
             source, sequence = self.data[6] & SOURCE_MASK, int.from_bytes(self.data[10:12], "little")
         elif self.kind is Kind.ASCII:
-            sequence = int(self._ascii_header[2])
+            source, sequence = self._ascii_name[2], int(self._ascii_header[2])
         return self.message_id, source, sequence, self.week, self.ms
+
+    @property
+    def _ascii_name(self) -> tuple[str, str, int]:
+        """Name, format letter (A a log, R a response), measurement source, as of "BESTPOSA_1"."""
+        name, _, source = self._ascii_header[0].partition("_")
+        return name[:-1], name[-1], int(source) if source.isdecimal() else 0
 
     @property
     def _ascii_header(self) -> list[str]:

@@ -24,9 +24,11 @@ from polecal.drivers.novatel_span.enums import (
     OffsetFrame,
     OffsetSource,
     PositionType,
+    RelativeOutput,
     SolutionStatus,
     StatusEvent,
     StatusWord,
+    Switch,
     TimeStatus,
     UtcStatus,
 )
@@ -279,7 +281,7 @@ class BestVel(Log):
     horizontal_speed_mps: F64
     course_deg: F64
     vel_up_mps: F64
-    reserved: U32
+    reserved: F32
 
 
 @log(MessageId.TIME)
@@ -397,8 +399,8 @@ class InsConfig(Log):
     profile: Annotated[InsProfile | int, Wire("I", InsProfile)]
     enabled_updates: X32
     alignment_mode: Annotated[AlignmentMode | int, Wire("I", AlignmentMode)]
-    relative_ins_output: U32
-    relative_from_master: U32
+    relative_output: Annotated[RelativeOutput | int, Wire("I", RelativeOutput)]
+    relative_from_master: Annotated[Switch | int, Wire("I", Switch)]
     ins_receiver_status: X32
     seed_enabled: U8
     seed_validation: U8
@@ -547,5 +549,5 @@ def _read(frame: Frame) -> Any:
         if frame.kind in (Kind.BINARY, Kind.SHORT_BINARY):
             return of.unpack(frame.body)[0]
         return of.scan(iter(ascii_tokens(frame.body)))
-    except (struct.error, KeyError, StopIteration, RuntimeError, OverflowError) as error:
+    except (struct.error, StopIteration, RuntimeError, OverflowError) as error:
         raise ValueError(f"a {frame.name} that is not as it should be: {error!r}") from error
