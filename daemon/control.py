@@ -99,6 +99,7 @@ def _finite(value: object) -> object:
 
 
 def as_message(error: PolecalError) -> Message:
+    """Write an error as the protocol's object."""
     return {"class": "ERROR", "code": code_of(error), "message": str(error), "hint": error.hint}
 
 
@@ -339,6 +340,10 @@ class Client:
     def close(self) -> None:
         """Leave."""
         self._socket.close()
+
+    def patience(self, timeout_s: float | None) -> None:
+        """Set how long an answer may take from now on."""
+        self._socket.settimeout(timeout_s)
 
     def request(self, request: Message) -> Message:
         """Ask, and return the answer. Raises Refused for an ERROR, NoDaemon if the daemon goes away."""

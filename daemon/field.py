@@ -12,8 +12,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from enum import Enum
+from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -62,17 +63,16 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    shared = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    shared = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
     shared.add_argument("--socket", type=Path, metavar="PATH", help=f"the daemon's, else {_SOCKET}")
     shared.add_argument("--json", action="store_true", help="print what the daemon says, as it is")
-    parser = _Parser(
-        prog="polecal-field", description="Calibrate a laser's pose in the field.", parents=[shared]
-    )
+    about = "Calibrate the pose of a vehicle's laser in the field."
+    parser = _Parser(prog="polecal-field", description=about, parents=[shared])
     parser.set_defaults(socket=Path(os.environ.get("POLECAL_SOCKET") or _SOCKET), json=False)
     parser.add_argument("--version", action="version", version=__version__)
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
-    def verb(run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
+    def verb(run: Callable[[argparse.Namespace], int], about: str) -> _Parser:
         name = run.__name__.strip("_")
         made = verbs.add_parser(name, parents=[shared], help=about, description=about.capitalize() + ".")
         made.set_defaults(run=run)
@@ -99,8 +99,8 @@ def _parser() -> argparse.ArgumentParser:
     decode.add_argument("file", metavar="FILE", help="- for standard input")
     decode.add_argument("--as", dest="kind", choices=["sick_lms", "novatel_span"], required=True)
     emulate = verb(_emulate, "run an emulated laser and receiver on pseudo-terminals")
-    emulate.add_argument("--lms-link", type=Path, metavar="PATH", help="name the laser's terminal so")
-    emulate.add_argument("--span-link", type=Path, metavar="PATH", help="name the receiver's terminal so")
+    emulate.add_argument("--lms-link", metavar="PATH", help="name the laser's terminal so")
+    emulate.add_argument("--span-link", metavar="PATH", help="name the receiver's terminal so")
     emulate.add_argument("--seed", type=int, default=1, metavar="N", help="which drive in which world")
     emulate.add_argument("--seconds", type=float, metavar="S", help="end after so long")
     demo = verb(_demo, "calibrate emulated devices with a real daemon; found against true")
@@ -135,9 +135,8 @@ def _start(arguments: argparse.Namespace) -> int:
         return 0
     print(f"session {answer.get('session')} has started")
     for device in answer.get("devices") or []:
-        print(
-            f"  {device.get('name')}: {device.get('state')} on {device.get('port')}", _about(device), sep=""
-        )
+        about = " on ".join(str(device[key]) for key in ("identity", "port") if device.get(key))
+        print(f"  {device.get('name')}: {device.get('state')}, {about}")
     return 0
 
 
@@ -152,32 +151,33 @@ def _say_waiting(client: Client, said: dict[str, str]) -> None:
                 print(f"  {name}: {told} ...", file=sys.stderr)
 
 
-def _about(device: dict[str, Any]) -> str:
-    identity = device.get("identity")
-    return f": {identity}" if identity else ""
-
-
 def _status(arguments: argparse.Namespace) -> int:
+    if arguments.watch:
+        return _watch(arguments)
+    deadline_s = time.monotonic() + _STATUS_S
     with Client(arguments.socket, _STATUS_S) as client:
-        if not arguments.watch:
-            status = client.request({"class": "STATUS"})
-            _show(status, arguments)
-            return _health(status)
-        client.patience(_ANSWER_S)
-        code = 0
-        live = Live(console=Console(), auto_refresh=False, screen=True)
-        redrawn = sys.stdout.isatty() and not arguments.json
-        with live if redrawn else contextlib.nullcontext(), contextlib.suppress(KeyboardInterrupt):
-            for status in client.watch():
-                code = _health(status)
-                if redrawn:
-                    live.update(Screen(status), refresh=True)
-                else:
-                    _show(status, arguments)
-                    sys.stdout.flush()
-        if redrawn:
-            Console().print(Screen(status))
-        return code
+        client.patience(max(0.01, deadline_s - time.monotonic()))
+        status = client.request({"class": "STATUS"})
+    _show(status, arguments)
+    return _health(status)
+
+
+def _watch(arguments: argparse.Namespace) -> int:
+    console = Console()
+    redrawn = console.is_terminal and not arguments.json
+    live = Live(console=console, auto_refresh=False, screen=True)
+    status: dict[str, Any] = {}
+    shown = live if redrawn else contextlib.nullcontext()
+    with Client(arguments.socket, _ANSWER_S) as client, contextlib.suppress(KeyboardInterrupt), shown:
+        for status in client.watch():
+            if redrawn:
+                live.update(Screen(status), refresh=True)
+            else:
+                _show(status, arguments)
+                sys.stdout.flush()
+    if redrawn:  # the other screen is gone: leave the last state on this one
+        _show(status, arguments)
+    return _health(status)
 
 
 def _health(status: dict[str, Any]) -> int:
@@ -221,7 +221,8 @@ def _stop(arguments: argparse.Namespace) -> int:
         _print_json(answer)
     else:
         print(f"session {answer.get('session')} has ended: {answer.get('state')}")
-    return _EXIT_BY_STATE.get(answer.get("state"), 0) if arguments.calibrate else 0
+    state = answer.get("state")
+    return _EXIT_BY_STATE[state] if arguments.calibrate and state in _EXIT_BY_STATE else 0
 
 
 def _result(arguments: argparse.Namespace) -> int:
@@ -295,7 +296,7 @@ def _decode(arguments: argparse.Namespace) -> int:
         skips.clear()
 
     with _opened(arguments.file) as stream:
-        while data := stream.read(_DECODE_BYTES):
+        while data := stream.read1(_DECODE_BYTES):
             put(framer.feed(data, 0))
     put(framer.close() or [])
     sys.stdout.flush()
@@ -303,9 +304,9 @@ def _decode(arguments: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def _opened(name: str) -> Iterator[IO[bytes]]:
+def _opened(name: str) -> Iterator[BufferedReader]:
     if name == "-":
-        yield sys.stdin.buffer
+        yield cast(BufferedReader, sys.stdin.buffer)
         return
     try:
         stream = Path(name).open("rb")  # noqa: SIM115

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-WIDTH, HEIGHT = 80, 24
+WIDTH, HEIGHT = 80, 23  # of 80 by 24: the prompt needs a line too
 NONE = "—"
 
 _UNKNOWNS = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
@@ -34,7 +34,7 @@ _GRID_SLICES = 24  # more are marks alone
 _PROBLEM_LINES = 2  # of a device's problem, and again of its hint
 _LEAST_TALK = 3  # lines for verdict and notes; where a rose leaves fewer, there is none
 _ASCII = str.maketrans({"✓": "+", "·": "-", "●": "*", "○": "o", "—": "-", "▶": ">", "→": ">", "…": "~"}) | (
-    str.maketrans({"°": "d", "±": "+", "√": "", "–": "-", "×": "x", "─": "-"})
+    str.maketrans({"°": "d", "±": "+", "√": "", "–": "-", "×": "x", "─": "-", "σ": "s"})
 )
 
 
@@ -48,7 +48,7 @@ class Screen:
         width = min(options.max_width, WIDTH)
         for line in _lines(self._status, width):
             if options.ascii_only:
-                line.plain = line.plain.translate(_ASCII)
+                line.plain = line.plain.translate(_ASCII).encode("ascii", "replace").decode()
             line.rstrip()
             line.truncate(width, overflow="ellipsis")
             line.no_wrap = True
@@ -62,6 +62,7 @@ def _lines(status: Mapping[str, Any], width: int) -> list[Text]:
         top += _device(device, width)
     top.append(Text("─" * width, style="dim"))
     bottom = _said("▶ next: ", [status["next"]], width, 2, "bold") if status.get("next") else []
+    top = top[: HEIGHT - len(bottom)]
     room = HEIGHT - len(top) - len(bottom)
     notes = _said("! ", _list(status.get("notes")), width, 3, "yellow")
     ended = status.get("state") in ("accepted", "rejected")
@@ -74,7 +75,7 @@ def _lines(status: Mapping[str, Any], width: int) -> list[Text]:
         for number, laser in enumerate(lasers):
             share = (room - len(middle)) // (len(lasers) - number)
             middle += _brief(laser, ended, width, share)
-    return [*top, *middle, *bottom][:HEIGHT]
+    return [*top, *middle, *bottom]
 
 
 def _title(status: Mapping[str, Any], width: int) -> Text:
@@ -145,7 +146,8 @@ def _rose(slices: list[Mapping[str, Any]], done: str) -> list[Text]:
         column = middle + aside if aside > 0 else middle + aside + 1 - cell.cell_len
         if aside == 0:
             column = middle - _CELL // 2
-        rows[round(-_ROSE_RADIUS_Y * math.cos(angle))].append((column, cell))
+        row = round(-_ROSE_RADIUS_Y * math.cos(angle))
+        rows[min(max(row, 1 - half), half - 1)].append((column, cell))
     if not rows[0]:
         rows[0] = [(1, Text("W", "dim")), (_ROSE_WIDTH - 2, Text("E", "dim"))]
     rows[0].append((middle - len(done) // 2, Text(done, "bold")))
