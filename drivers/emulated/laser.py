@@ -60,7 +60,8 @@ class EmulatedLaser(EmulatedDevice):
 
     It powers up at ``t0_ns`` at ``baud``, and says so ``boot_s`` later. ``drift_ppm`` is how much longer
     than nominal its mirror's turn is. ``eeprom`` is the stored configuration (34 bytes, section 3.2), and
-    ``eeprom_writes`` counts what was written to it. The world's motion starts with the first stream.
+    ``eeprom_writes`` counts what was written to it. The world's motion starts with the first stream, unless
+    ``starts_world`` is false.
     """
 
     def __init__(
@@ -76,10 +77,12 @@ class EmulatedLaser(EmulatedDevice):
         address: int = 0,
         boot_s: float = 0.5,
         ack_s: float = 0.010,
+        starts_world: bool = True,
         quirks: Quirks | None = None,
     ) -> None:
         super().__init__(t0_ns=t0_ns, seed=seed, baud=baud)
         self._world = world
+        self._starts_world = starts_world
         self._t0_ns = t0_ns
         self._revolution_ns = REVOLUTION_NS * (1 + drift_ppm * 1e-6)
         self.config = eeprom
@@ -118,7 +121,8 @@ class EmulatedLaser(EmulatedDevice):
         self.variant = variant
         self.config = lms.STREAM_CONFIG
         self.mode = Mode.STREAM
-        self._world.start(t_ns)
+        if self._starts_world:
+            self._world.start(t_ns)
         self._resume(t_ns)
 
     # --- hearing
@@ -170,7 +174,7 @@ class EmulatedLaser(EmulatedDevice):
         self._line.send(
             ready_ns, lms.reply(answer.code, answer.data, self._status(), self._address), answer.then_baud
         )
-        if self.streaming:
+        if self.streaming and self._starts_world:
             self._world.start(t_ns)
         self._resume(self._line.busy_until_ns)
 

@@ -136,8 +136,9 @@ def value_words(range_m: NDArray[np.float64], level: NDArray[np.int64], config: 
     distance = np.rint(np.where(seen, range_m, 0.0) * per_metre).clip(0, top - _OVER_MAXIMUM)
     distance = np.where(seen, distance, top - _NO_ECHO).astype(np.uint16)
     level_bits = _LEVEL_BITS.get(mode, 0)
-    flags = (level >> (3 - level_bits)).astype(np.uint16) << np.uint16(bits) if level_bits else 0
-    return np.asarray(distance | flags, np.uint16)
+    if level_bits:
+        distance |= np.where(seen, level >> (3 - level_bits), 0).astype(np.uint16) << np.uint16(bits)
+    return distance
 
 
 def values(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import random
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -91,13 +91,6 @@ class EmulatedReceiver(SpanPort):
         self._overrun = False
         self.lost_logs = 0
         """Logs that did not fit into the port's buffer."""
-
-    def force_logs(self, t_ns: int, logs: Iterable[tuple[str, float]], baud: int = 230400) -> None:
-        """Want logs as (name with suffix, period in s) at a rate, as though the host had asked."""
-        self._advance(t_ns)
-        self._line.baud = baud
-        for message, period_s in logs:
-            self._wanted(t_ns, message, "ONTIME", period_s, 0.0)
 
     def epoch_ns(self, gps_ms: int) -> int:
         """Return the host's moment of a GPS time in ms since the GPS epoch."""

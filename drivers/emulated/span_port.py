@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from abc import abstractmethod
+from collections.abc import Iterable
 
 from polecal.drivers.emulated import span_frames as span
 from polecal.drivers.emulated.line import EmulatedDevice
@@ -49,6 +50,18 @@ class SpanPort(EmulatedDevice):
         self._heard = bytearray()
         self._replies = True
         self._takes_ascii = True
+
+    def force_logs(self, t_ns: int, logs: Iterable[tuple[str, float]], baud: int = 230400) -> None:
+        """Want logs as (name with suffix, period in s) at a rate, as though the host had asked.
+
+        Raises ValueError for a log that would be refused.
+        """
+        self._advance(t_ns)
+        self._line.baud = baud
+        for message, period_s in logs:
+            number, text = self._wanted(t_ns, message, "ONTIME", period_s, 0.0)
+            if number != _OK[0]:
+                raise ValueError(f"{message}: {text}")
 
     # --- hearing
 

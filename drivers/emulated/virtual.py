@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from polecal.drivers.emulated.laser import EmulatedLaser
 from polecal.drivers.emulated.line import EmulatedDevice
-from polecal.drivers.emulated.receiver import EmulatedReceiver
-from polecal.drivers.emulated.world import World, demo_world
+from polecal.drivers.emulated.receiver import EmulatedReceiver, PlaybackReceiver, recorded_path
+from polecal.drivers.emulated.world import MountPose, World, demo_world
 
 STREAM_LOGS = (("INSPVASB", 0.01), ("BESTPOSB", 1.0), ("TIMEB", 1.0))
 """What a host wants of the receiver, as (log, period in s)."""
+
+
+RECORDED_LOGS = (("INSPVAXB", 0.05), ("BESTPOSB", 1.0), ("TIMEB", 1.0))
+"""The same of a receiver that plays a recording: it says what it once said."""
+
+_RECORDED_POLE_NE_M = (3.25, -0.75)
+_RECORDED_GROUND_M = 0.1  # below the recorded vehicle's reference point, where that was at first
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +28,8 @@ class Rig:
 
     world: World
     laser: EmulatedLaser
-    receiver: EmulatedReceiver
+    receiver: EmulatedReceiver | PlaybackReceiver
+    logs: tuple[tuple[str, float], ...] = STREAM_LOGS
 
     @classmethod
     def demo(cls, seed: int, t0_ns: int) -> Rig:
@@ -33,10 +41,36 @@ class Rig:
             EmulatedReceiver(world, t0_ns=t0_ns, seed=seed),
         )
 
+    @classmethod
+    def recorded(
+        cls,
+        recording: tuple[bytes, Sequence[int], Sequence[float]],
+        *,
+        t0_ns: int,
+        mount: MountPose,
+        seed: int = 0,
+        pole_ne_m: tuple[float, float] = _RECORDED_POLE_NE_M,
+        ground_z_m: float = _RECORDED_GROUND_M,
+    ) -> Rig:
+        """Return a receiver that plays a recording (`load_recording`), and a laser on that same driven path.
+
+        The world's origin is the recording's first pose, and its motion begins with the first chunk.
+        """
+        path, origin = recorded_path(*recording)
+        world = World(
+            path, mount=mount, pole_ne_m=pole_ne_m, ground_z_m=ground_z_m, reference=origin, seed=seed
+        )
+        return cls(
+            world,
+            EmulatedLaser(world, t0_ns=t0_ns, seed=seed, starts_world=False),
+            PlaybackReceiver(*recording, t0_ns=t0_ns, seed=seed, on_start=world.start),
+            RECORDED_LOGS,
+        )
+
     def stream(self, t_ns: int) -> None:
         """Have both devices stream as after a host's whole set-up."""
         self.laser.force_stream(t_ns)
-        self.receiver.force_logs(t_ns, STREAM_LOGS)
+        self.receiver.force_logs(t_ns, self.logs)
 
 
 def play(

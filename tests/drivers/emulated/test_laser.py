@@ -346,3 +346,56 @@ def test_the_same_seed_gives_the_same_bytes(parked, host, t0_ns):
 
     assert record(3) == record(3)
     assert record(3) != record(4)
+
+
+# --- what real lasers do at times
+
+
+def quirky(parked, host, t0_ns, **quirks):
+    client = host(EmulatedLaser(parked(), t0_ns=t0_ns, quirks=Quirks(**quirks)), 9600)
+    client.listen(1.0)
+    return client
+
+
+def test_an_info_may_be_pending(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, info_pending=1.0)
+    assert client.ask(known("20h 25")) == ACK + known("A0h mode switch ok (status 11h)")
+
+
+def test_requests_may_be_overlooked(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, lost_ack=0.5)
+    answered = [bool(client.ask(known("3Ah"))) for _ in range(40)]
+    assert 8 < sum(answered) < 32
+
+
+def test_scans_may_be_cut_short(parked, host, t0_ns):
+    laser = EmulatedLaser(parked(), t0_ns=t0_ns, quirks=Quirks(cut_scan=1.0))
+    laser.force_stream(t0_ns)
+    stream = host(laser, 500000).listen(2.0)
+    assert 0 < len(stream) < 814 * 30
+    assert scans_ok(stream) == 0
+
+
+def scans_ok(stream):
+    at = [i for i in range(len(stream) - 813) if stream[i : i + 4] == b"\x02\x80\x28\x03"]
+    return sum(
+        lms.crc16(stream[i : i + 812]) == int.from_bytes(stream[i + 812 : i + 814], "little") for i in at
+    )
+
+
+def test_a_configuration_may_be_refused(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, refuse_config=True)
+    client.ask(known(INSTALL))
+    assert client.ask(known(CONFIG_01))[5:7] == b"\xf7\x00"
+    assert client.device.eeprom_writes == 0
+
+
+def test_old_firmware_has_32_bytes_of_configuration(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, short_config=True)
+    assert client.ask(known("74h")) == ACK + lms.reply(0xF4, lms.DEFAULT_CONFIG[:32])
+
+
+def test_a_beam_without_an_echo_is_an_overflow_code(parked, host, t0_ns):
+    laser = EmulatedLaser(parked(), t0_ns=t0_ns, quirks=Quirks(no_echo=1.0))
+    laser.force_stream(t0_ns)
+    assert set(words(scans(host(laser, 500000).listen(0.2))[0])) == {8191}

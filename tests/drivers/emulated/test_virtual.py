@@ -3,7 +3,9 @@ import numpy as np
 from novatel_edie import oem
 
 from polecal.drivers.emulated import laser_telegrams as lms
+from polecal.drivers.emulated.receiver import load_recording
 from polecal.drivers.emulated.virtual import Rig, play
+from polecal.drivers.emulated.world import HAND_MEASURED
 
 START_NS = 5_000_000_000
 
@@ -65,3 +67,23 @@ def test_a_script_is_what_the_host_writes():
     assert front.endswith(b"\x06" + lms.reply(0xBA, b"LMS291;S05;V02.10 "))
     assert b"".join(data for name, _, data in heard if name == "span") == b"\r\n<OK\r\n[COM1]"
     assert next(t_ns for name, t_ns, _ in heard if name == "span") > START_NS + 2 * 10**9
+
+
+def test_a_recorded_rig_sees_the_pole_from_all_twelve_slices(captures):
+    recording = load_recording(captures / "span_driver_ins_ppp_driven_20hz.bin")
+    rig = Rig.recorded(recording, t0_ns=START_NS, mount=HAND_MEASURED)
+    rig.stream(START_NS)
+    devices = {"front": rig.laser, "span": rig.receiver}
+    heard = list(play(devices, start_ns=START_NS, seconds=115.0, chunk_s=0.005))
+    assert b"".join(data for name, _, data in heard if name == "span") == recording[0]
+    assert rig.world.start_ns == START_NS + 20_000_000
+    front = b"".join(data for name, _, data in heard if name == "front")
+    bearing = np.deg2rad(50 - 0.25 * np.arange(401))
+    returns = np.zeros(12, int)
+    for at in range(0, len(front) - 814, 814):
+        words = np.frombuffer(front, "<u2", 401, at + 7)
+        t_s = at / 814 * 4 * 0.01332 - 0.02
+        rpy = rig.world.trajectory.pose([max(t_s, 0.0)])[1]
+        bright = (words >> 13 >= 6) & ((words & 0x1FFF) < 800)
+        returns[int(np.rad2deg(rpy[0, 2]) % 360 // 30)] += np.count_nonzero(bright & (np.abs(bearing) < 0.9))
+    assert returns.min() > 0
