@@ -12,7 +12,7 @@ from polecal.drivers.novatel_span.enums import (
 )
 from polecal.drivers.novatel_span.framer import Fault, Frame, Framer, Kind, Skip
 from polecal.drivers.novatel_span.logs import BestPos, InsPva, InsPvax, Time, Version, parse
-from polecal.drivers.novatel_span.nav import Deduplicator, NavState, nav_state
+from polecal.drivers.novatel_span.nav import Deduplicator, NavState, nav_state, reference_point
 
 __all__ = [
     "BestPos",
@@ -37,4 +37,5 @@ __all__ = [
     "columns",
     "nav_state",
     "parse",
+    "reference_point",
 ]

@@ -17,7 +17,8 @@ from polecal.drivers.errors import DeviceError, DeviceNotFound, DeviceProtocolEr
 from polecal.drivers.novatel_span.commands import Command, com_config, log, serial_config, unlog_all
 from polecal.drivers.novatel_span.enums import FINE_TIME, Component, MessageId, TimeStatus, Trigger
 from polecal.drivers.novatel_span.framer import Frame, Framer, Kind
-from polecal.drivers.novatel_span.logs import Response, Version, parse
+from polecal.drivers.novatel_span.logs import InsConfig, Response, Version, parse
+from polecal.drivers.novatel_span.nav import reference_point
 from polecal.drivers.port import BITS_PER_BYTE, Chunk, Port, Tap
 
 RATES = (115200, 9600, 230400, 57600, 38400, 19200, 460800, 921600)
@@ -43,6 +44,7 @@ SLOW_LOGS = (MessageId.BESTPOS, MessageId.TIME)
 USABLE = 0.95
 """How much of the line the logs may fill."""
 
+_ABOUT_ITSELF = (MessageId.VERSION, MessageId.INSCONFIG)
 _PORT_OF_ADDRESS = {1: "COM1", 2: "COM2", 3: "COM3"}  # a header's port address // 32 (sheet 3.6)
 
 
@@ -67,6 +69,8 @@ class NovatelSpan(Device):
         self.silence_s = max(Device.silence_s, 3.0 / rate_hz)
         self.pose: MessageId | None = None
         """The pose log that the receiver sends."""
+        self.reference_point = reference_point(None)
+        """Which point of the vehicle the poses speak of, as far as the receiver says."""
         self.results: dict[str, str] = {}
         """What the receiver answered to each command of the last set-up: OK, ERROR:..., or nothing."""
         self._talk: _Talk | None = None
@@ -76,13 +80,14 @@ class NovatelSpan(Device):
         self.pose, self.results, self._talk = None, {}, None
         self._talk = self._find(port)
         self._talk = self._set_rate(port, self._talk)
-        self._say_who(self._talk)
+        self._ask(self._talk, log(MessageId.INSCONFIG, Trigger.ONCE))  # OEM7 has it, others may refuse
         self.pose = self._request_pose(self._talk, port, period_s)
         for message in SLOW_LOGS:
             command = log(message, Trigger.ONTIME, 1.0)
             if (answer := self._ask(self._talk, command)).startswith("ERROR"):
                 self._log.warning("the receiver refuses a log", command=command.text, answer=answer)
         self._await_pose(self._talk, self.pose, period_s)
+        self._say_who(self._talk)
 
     def _heard(self, chunk: Chunk) -> bool:
         assert self._talk is not None
@@ -135,8 +140,8 @@ class NovatelSpan(Device):
         talk.start_line()
         talk.send(unlog_all(held=True))
         talk.send(log(MessageId.VERSION, Trigger.ONCE))
-        if not talk.listen(self.answer_s, lambda _: talk.answered) and talk.checked:
-            talk.listen(self.patience_s, lambda _: talk.answered)
+        if not talk.listen(self.answer_s, lambda: talk.answered) and talk.checked:
+            talk.listen(self.patience_s, lambda: talk.answered)
         if talk.answered:
             talk.drain(self.quiet_s, self.patience_s)
         return talk.answered
@@ -214,7 +219,7 @@ class NovatelSpan(Device):
         return answer
 
     def _await_pose(self, talk: _Talk, pose: MessageId, period_s: float) -> None:
-        if pose in talk.ids or talk.listen(self.patience_s + 2 * period_s, lambda _: pose in talk.ids):
+        if pose in talk.ids or talk.listen(self.patience_s + 2 * period_s, lambda: pose in talk.ids):
             return
         clock = talk.time_status
         why = "" if clock is None or clock in FINE_TIME else f"; the receiver's time is {_word(clock)}"
@@ -228,6 +233,7 @@ class NovatelSpan(Device):
         for part in talk.version.components if talk.version else ():
             if part.component == Component.GPSCARD:
                 self.identity = f"NovAtel {part.hardware}, model {part.model}, firmware {part.software}"
+        self.reference_point = reference_point(talk.config)
 
 
 class _Talk:
@@ -247,9 +253,10 @@ class _Talk:
         self.heard_bytes = 0
         self.ids: set[int | None] = set()
         self.version: Version | None = None
+        self.config: InsConfig | None = None
         self.time_status: TimeStatus | int | None = None
         self._framer = Framer()
-        self._answers: deque[str] = deque()
+        self._answers: deque[str] = deque(maxlen=8)
 
     @property
     def has_rate(self) -> bool:
@@ -268,15 +275,15 @@ class _Talk:
         """Send a command; return "OK", "ERROR:" and the receiver's text, or "" where no reply came."""
         self._answers.clear()
         self.send(command)
-        self.listen(timeout_s, lambda _: bool(self._answers))
+        self.listen(timeout_s, lambda: bool(self._answers))
         return self._answers.popleft() if self._answers else ""
 
-    def listen(self, timeout_s: float, enough: Callable[[Frame], bool]) -> bool:
-        """Read until a frame is ``enough``, and return True, or for ``timeout_s``."""
+    def listen(self, timeout_s: float, enough: Callable[[], bool]) -> bool:
+        """Read until what was heard is ``enough``, and return True, or for ``timeout_s``."""
         deadline_s = time.monotonic() + timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0:
             chunk = self.port.read(left_s)
-            if chunk is not None and any([enough(frame) for frame in self.take(chunk)]):
+            if chunk is not None and self.take(chunk) and enough():
                 return True
         return False
 
@@ -306,12 +313,14 @@ class _Talk:
             self.time_status = frame.time_status or self.time_status
             if frame.port_address is not None and not self.port_name:
                 self.port_name = _PORT_OF_ADDRESS.get(frame.port_address >> 5, "")
-            said = parse(frame) if frame.is_response or frame.message_id == MessageId.VERSION else None
+            said = parse(frame) if frame.is_response or frame.message_id in _ABOUT_ITSELF else None
             if isinstance(said, Response):
                 self.answered = self.replies = True
                 self._answers.append("OK" if said.ok else f"ERROR:{said.text}")
             elif isinstance(said, Version):
                 self.answered, self.version = True, said
+            elif isinstance(said, InsConfig):
+                self.config = said
 
 
 def _word(status: TimeStatus | int) -> str:

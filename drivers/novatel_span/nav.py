@@ -6,9 +6,15 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from polecal.drivers.novatel_span.enums import InsStatus, MessageId, PositionType
+from polecal.drivers.novatel_span.enums import (
+    InsOffset,
+    InsStatus,
+    MessageId,
+    OffsetFrame,
+    PositionType,
+)
 from polecal.drivers.novatel_span.framer import Frame
-from polecal.drivers.novatel_span.logs import InsPva, InsPvax, parse
+from polecal.drivers.novatel_span.logs import InsConfig, InsPva, InsPvax, parse
 
 WEEK_NS = 604_800 * 10**9
 Triple = tuple[float, float, float]
@@ -102,6 +108,21 @@ def nav_state(frame: Frame) -> NavState | None:
         attitude_sigma_deg,
         frame.name or "",
     )
+
+
+def reference_point(config: InsConfig | None) -> str:
+    """Say which point of the vehicle pose logs speak of, from INSCONFIG where there is one (sheet section 4).
+
+    The laser's offset must be measured from that point.
+    """
+    if config is None:
+        return "the IMU's centre of navigation, unless an offset was set in the receiver (it does not say)"
+    for item in config.translations:
+        if item.offset == InsOffset.USER and any(item.xyz):
+            xyz = ", ".join(f"{value:g}" for value in item.xyz)
+            frame = item.frame.name if isinstance(item.frame, OffsetFrame) else item.frame
+            return f"the user's point at ({xyz}) m from the IMU's centre of navigation, {frame} axes"
+    return "the IMU's centre of navigation"
 
 
 class Deduplicator:

@@ -150,6 +150,7 @@ class Peer:
         if number == 1:
             message, _, _, trigger = struct.unpack_from("<HBBI", body, 4)
             names = {37: "VERSIONB", 42: "BESTPOSB", 101: "TIMEB", 508: "INSPVASB", 1465: "INSPVAXB"}
+            names[1945] = "INSCONFIGB"
             period = f"ONTIME {struct.unpack_from('<d', body, 12)[0]:g}" if trigger == 2 else "ONCE"
             line = f"LOG {names[message]} {period}"
         else:
@@ -204,6 +205,7 @@ def make_peer(vectors):
         "BESTPOSB": "BESTPOSB INS_PPP",
         "TIMEB": "TIMEB OEM7",
         "VERSIONB": "VERSIONB (source bit=1)",
+        "INSCONFIGB": "INSCONFIGB",
     }
     messages = {log: vectors[name]["wire"] for log, name in names.items()}
     peers = []

@@ -50,11 +50,13 @@ def test_a_receiver_at_another_rate_is_found_and_brought_to_ours(make_peer):
     assert peer.logs == {"INSPVASB": 0.02, "BESTPOSB": 1.0, "TIMEB": 1.0}
     assert device.results == {
         "SERIALCONFIG COM1 115200 N 8 1 N OFF": "OK",
+        "LOG INSCONFIGB ONCE": "OK",
         "LOG INSPVASB ONTIME 0.02": "OK",
         "LOG BESTPOSB ONTIME 1": "OK",
         "LOG TIMEB ONTIME 1": "OK",
     }
     assert device.identity == "NovAtel OEMV3G-4.00-X2T, model L12LRVA, firmware 3.301"
+    assert device.reference_point == "the IMU's centre of navigation"
 
 
 def test_nothing_is_saved_in_the_receiver(make_peer):
@@ -92,6 +94,13 @@ def test_a_refused_slow_log_does_not_stop_the_poses(make_peer):
     set_up(device)
     assert device.results["LOG BESTPOSB ONTIME 1"].startswith("ERROR")
     assert set(peer.logs) == {"INSPVASB", "TIMEB"}
+
+
+def test_a_receiver_that_does_not_tell_its_setup_is_used_all_the_same(make_peer):
+    device = span(make_peer(refuse=["INSCONFIGB", "VERSIONB"]))
+    set_up(device)
+    assert device.identity == "NovAtel receiver"
+    assert "does not say" in device.reference_point
 
 
 def test_an_old_receiver_takes_its_rate_by_com(make_peer):

@@ -3,6 +3,7 @@
 import itertools
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,8 +16,12 @@ from polecal.drivers.novatel_span import (
     MessageId,
     PositionType,
     nav_state,
+    parse,
+    reference_point,
 )
+from polecal.drivers.novatel_span.enums import InsOffset, OffsetFrame, OffsetSource
 from polecal.drivers.novatel_span.framer import crc32
+from polecal.drivers.novatel_span.logs import InsOffsetItem
 from polecal.drivers.novatel_span.nav import WEEK_NS
 
 
@@ -168,3 +173,15 @@ def test_a_week_that_ends_goes_on_in_gps_time(vectors):
         return nav_state(frame).gps_ns
 
     assert at(2101, 0.0) - at(2100, 604799.99) == 10_000_000
+
+
+def test_the_point_that_poses_speak_of_is_named(vectors):
+    (frame,) = Framer().feed(vectors["INSCONFIGB"]["wire"], 0)
+    config = parse(frame)
+    assert reference_point(config) == "the IMU's centre of navigation"
+    item = InsOffsetItem(
+        InsOffset.USER, OffsetFrame.VEHICLE, (0.5, 1.0, -0.25), (0.0, 0.0, 0.0), OffsetSource.FROM_COMMAND
+    )
+    told = reference_point(replace(config, translations=(item,)))
+    assert told == "the user's point at (0.5, 1, -0.25) m from the IMU's centre of navigation, VEHICLE axes"
+    assert "does not say" in reference_point(None)
