@@ -7,6 +7,7 @@ where one comes, and by the data in any case (sheet 1.6, 5). Nothing is ever sav
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from collections import deque
@@ -80,14 +81,22 @@ class NovatelSpan(Device):
         self.pose, self.results, self._talk = None, {}, None
         self._talk = self._find(port)
         self._talk = self._set_rate(port, self._talk)
-        self._ask(self._talk, log(MessageId.INSCONFIG, Trigger.ONCE))  # OEM7 has it, others may refuse
-        self.pose = self._request_pose(self._talk, port, period_s)
+        try:
+            self._start(port, self._talk, period_s)
+        except DeviceError:  # what did start must not go on for nobody
+            with contextlib.suppress(DeviceError):
+                self._leave(port)
+            raise
+
+    def _start(self, port: Port, talk: _Talk, period_s: float) -> None:
+        self._ask(talk, log(MessageId.INSCONFIG, Trigger.ONCE))  # OEM7 has it, others may refuse
+        self.pose = self._request_pose(talk, port, period_s)
         for message in SLOW_LOGS:
             command = log(message, Trigger.ONTIME, 1.0)
-            if (answer := self._ask(self._talk, command)).startswith("ERROR"):
+            if (answer := self._ask(talk, command)).startswith("ERROR"):
                 self._log.warning("the receiver refuses a log", command=command.text, answer=answer)
-        self._await_pose(self._talk, self.pose, period_s)
-        self._say_who(self._talk)
+        self._await_pose(talk, self.pose, period_s)
+        self._say_who(talk)
 
     def _heard(self, chunk: Chunk) -> bool:
         assert self._talk is not None

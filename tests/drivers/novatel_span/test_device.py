@@ -12,7 +12,7 @@ from polecal.drivers.novatel_span import MessageId, NovatelSpan
 class Span(NovatelSpan):
     """With less patience, as a pseudo-terminal is quick."""
 
-    answer_s = 0.2
+    answer_s = 0.3
     patience_s = 0.6
     quiet_s = 0.05
 
@@ -203,6 +203,7 @@ def test_a_log_that_was_granted_but_never_comes_is_an_error(make_peer):
     peer = make_peer(silent_logs=["INSPVASB"])
     with pytest.raises(DeviceProtocolError, match="no INSPVASB came"):
         set_up(span(peer))
+    assert peer.logs == {}  # and nothing else goes on for nobody
 
 
 def test_a_stopped_device_leaves_the_line_silent(make_peer):
