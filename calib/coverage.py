@@ -57,7 +57,7 @@ def headings(slices: Sequence[int], slice_deg: int) -> str:
     count = 360 // slice_deg
     wanted = set(slices)
     if len(wanted) == count:
-        return "any way"
+        return "0–360°"
     runs = []
     for first in sorted(wanted):
         if (first - 1) % count in wanted:

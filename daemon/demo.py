@@ -4,62 +4,177 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import yaml
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from polecal.calib import KEYS, Mount
-from polecal.daemon import screen
-from polecal.daemon.control import Client, Refused
+from polecal import PolecalError
+from polecal.calib import KEYS, PARAMETERS, Mount
+from polecal.daemon.control import Client
 from polecal.daemon.routine import ENDED, State
-from polecal.drivers.emulated.world import demo_world
+from polecal.daemon.screen import Screen
+from polecal.daemon.sessions import CALIBRATION, CAPTURE
 
-_MEASURED = Mount(0.0, -0.35, -1.0, 0.0, -8.0, 0.0)
-_SECONDS = 285.0
-_END_S = 15.0
+_MEASURED = Mount(0.0, -0.35, -1.0, 0.0, -8.0, 0.0)  # paper.md, Table IV
+_POLE = {"radius_m": 0.04, "height_m": 2.4}
+_DRIVE_S = 270.0  # then what there is is calibrated
+_READY_S = 20.0
+_LEAVE_S = 20.0
+_LINE_EVERY_S = 5.0
+
+
+class DemoError(PolecalError):
+    """A part of the demonstration did not come up."""
 
 
 def demo(out: Path, seed: int) -> int:
-    """Run the demonstration into the folder ``out``; give the exit code, 0 if it ended accepted."""
+    """Run the demonstration into the folder ``out``; give the exit code, 0 if it ended accepted.
+
+    Raises DemoError, and what the daemon refuses.
+    """
+    console = Console()
     out = out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    console = Console()
-    links = {name: out / f"tty-{name}" for name in ("lms", "span")}
-    config = {
+    began_s = time.monotonic()
+    with ExitStack() as stack:
+        truth = stack.enter_context(_emulated_devices(out, seed))
+        config = _write_config(out, truth)
+        socket_path = stack.enter_context(_daemon(out, config))
+        console.print(f"emulated laser and receiver (seed {seed}), and a real daemon: {out}")
+        with Client(socket_path, timeout_s=None) as client:
+            session = client.request({"class": "START", "name": "demo"})["session"]
+            console.print(f"session {session}: the vehicle drives past the pole, about three minutes")
+            _follow(client, console, began_s + _DRIVE_S)
+            if client.request({"class": "STATUS"})["state"] not in ENDED:
+                client.request({"class": "STOP", "calibrate": True})
+    folder = out / "state" / "sessions" / session
+    content = yaml.safe_load((folder / CALIBRATION).read_text(encoding="utf-8"))
+    laser = content["lasers"][0]
+    console.print(_against_truth(laser, truth["mount"]))
+    ratio = laser["measured_cost_m"] / laser["cost_m"]
+    console.print(
+        f"√c {laser['measured_cost_m']:.4f} m as measured by hand, {laser['cost_m']:.4f} m as found: "
+        f"{ratio:.1f} times less; {laser['passes']} passes, {laser['returns']['pole']} pole returns"
+    )
+    console.print(
+        f"[bold]{content['state']}[/bold] after {time.monotonic() - began_s:.0f} s", highlight=False
+    )
+    console.print(f"the same again from its capture: polecal-field replay {folder / CAPTURE}", soft_wrap=True)
+    return 0 if content["state"] == State.ACCEPTED else 5
+
+
+@contextmanager
+def _emulated_devices(out: Path, seed: int) -> Iterator[dict[str, Any]]:
+    """Serve the emulated devices; give their ports and the true mount."""
+    links = ["--lms-link", out / "tty-lms", "--span-link", out / "tty-span"]
+    with (
+        (out / "emulate.log").open("wb") as log,
+        _program("field", "emulate", *links, "--seed", seed, stdout=subprocess.PIPE, stderr=log) as program,
+    ):
+        assert program.stdout is not None
+        line = program.stdout.readline()
+        if not line:
+            raise DemoError("the emulated devices did not start", f"see {out / 'emulate.log'}")
+        truth: dict[str, Any] = json.loads(line)
+        yield truth
+
+
+@contextmanager
+def _daemon(out: Path, config: Path) -> Iterator[Path]:
+    """Run the daemon; give its socket once it says that it is ready, as it would to systemd."""
+    address = out / "notify"
+    address.unlink(missing_ok=True)
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify,
+        (out / "polecald.log").open("wb") as log,
+    ):
+        notify.bind(str(address))
+        notify.settimeout(_READY_S)
+        environment = os.environ | {"NOTIFY_SOCKET": str(address)}
+        with _program("service", "--config", config, stderr=log, env=environment):
+            try:
+                notify.recv(64)
+            except TimeoutError:
+                raise DemoError("the daemon did not come up", f"see {out / 'polecald.log'}") from None
+            yield out / "run" / "control.sock"
+    address.unlink(missing_ok=True)
+
+
+@contextmanager
+def _program(module: str, *arguments: object, **how: Any) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", f"polecal.daemon.{module}", *map(str, arguments)]
+    with subprocess.Popen(command, **how) as program:  # noqa: S603 - ourselves
+        try:
+            yield program
+        finally:
+            program.terminate()
+            try:
+                program.wait(_LEAVE_S)
+            except subprocess.TimeoutExpired:
+                program.kill()
+
+
+def _write_config(out: Path, devices: Mapping[str, Any]) -> Path:
+    path = out / "polecal.yaml"
+    content = {
         "state_dir": str(out / "state"),
         "runtime_dir": str(out / "run"),
-        "lasers": [{"name": "front", "port": str(links["lms"]), "mount": _MEASURED.as_dict()}],
-        "navigation": {"port": str(links["span"])},
-        "pole": {"radius_m": 0.04, "height_m": 2.4},
+        "lasers": [{"name": "front", "port": devices["lms"], "mount": _MEASURED.as_dict()}],
+        "navigation": {"port": devices["span"]},
+        "pole": _POLE,
     }
-    path = out / "polecal.yaml"
-    path.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
-    console.print(f"emulated laser and receiver, a real daemon on {path}, seed {seed}")
-    emulate = ["emulate", "--lms-link", links["lms"], "--span-link", links["span"], "--seed", seed]
-    with ExitStack() as running:
-        running.enter_context(
-            _program("polecal.daemon.field", *emulate, "--seconds", _SECONDS, log=out / "emulated.log")
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def _follow(client: Client, console: Console, until_s: float) -> None:
+    """Show the run until it ends: the status screen on a terminal, else a line now and then."""
+    spoken_s = 0.0
+    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+    with live or ExitStack():
+        for status in client.watch():
+            if live is not None:
+                live.update(Screen(status), refresh=True)
+            elif time.monotonic() - spoken_s >= _LINE_EVERY_S:
+                spoken_s = time.monotonic()
+                console.print(_line(status), soft_wrap=True, highlight=False)
+            if status["state"] in ENDED or time.monotonic() > until_s:
+                return
+
+
+def _line(status: Mapping[str, Any]) -> str:
+    laser = status["lasers"][0]
+    done = sum(part["done"] for part in laser["coverage"])
+    cost = "" if laser["cost_m"] is None else f", cost {laser['cost_m']:.3f} m"
+    return (
+        f"{status['since_s']:6.1f} s {status['state']}: {laser['passes']} passes, "
+        f"{done} of {len(laser['coverage'])} slices{cost}; {status['next']}"
+    )
+
+
+def _against_truth(laser: Mapping[str, Any], truth: Mapping[str, float]) -> Table:
+    table = Table(title="found against true")
+    for heading in ("", "by hand", "found", "true", "error", "σ", "error / σ", ""):
+        table.add_column(heading, justify="right")
+    for name, key in zip(PARAMETERS, KEYS, strict=True):
+        found, sigma = laser["estimate"][key], laser["sigma"][key]
+        error = found - truth[key]
+        row = (laser["measured"][key], found, truth[key], error, sigma)
+        unit = "m" if key.endswith("_m") else "°"
+        table.add_row(
+            f"{name} {unit}",
+            *(f"{value:.4f}" for value in row),
+            f"{error / sigma:+.1f}",
+            "held" if name in laser["held"] else "",
         )
-        running.enter_context(_program("polecal.daemon.service", "--config", path, log=out / "polecald.log"))
-        client = _connect(out / "run" / "control.sock")
-        running.enter_context(client)
-        started = client.request({"class": "START", "name": "demo"})
-        console.print(f"session {started['session']}")
-        state = _follow(client, console)
-        if state not in (State.ACCEPTED, State.REJECTED):
-            client.request({"class": "STOP", "calibrate": True})
-            state = client.request({"class": "STATUS"})["state"]
-    folder = out / "state" / "sessions" / started["session"]
-    laser = yaml.safe_load((folder / "calibration.yaml").read_text(encoding="utf-8"))["lasers"][0]
-    _print_against_truth(console, laser, demo_world(seed).mount)
-    console.print(f"{state}: {folder}")
-    console.print(f"again from the capture: polecal-field replay {folder / 'capture.mcap'}")
-    return 0 if state == State.ACCEPTED else 5
+    return table

@@ -16,8 +16,10 @@ from polecal.daemon.config import Config, Laser
 from polecal.daemon.passes import PassBuilder, StoredPass, observed
 from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
+from polecal.drivers.errors import DeviceProtocolError
 from polecal.drivers.port import BITS_PER_BYTE
 from polecal.drivers.sick_lms import REVOLUTION_S, Frame, Framer, Scan, beam_ages_s, bearings_rad, decode
+from polecal.drivers.sick_lms.scans import VALUES
 
 LEVELS_MODE = 0x01  # measuring mode 01: 13 bits of range, 3 of reflectivity (sheet, 3.3)
 
@@ -31,6 +33,8 @@ NO_POSE = "no pose at the beam's time"
 NO_CLOCK = "clocks not settled yet"
 STANDING = "vehicle standing"
 WAITED_TOO_LONG = "poses came too late"
+MALFORMED = "scan telegrams whose parts do not fit"
+OTHER_VARIANT = "scans of another angle or resolution"
 OTHER_REFLECTOR = "a reflector, but not the pole"
 
 
@@ -80,10 +84,18 @@ class LaserChannel:
     def feed(self, t_ns: int, data: bytes) -> None:
         """Take a chunk that was read at host time ``t_ns``."""
         for frame in self.framer.feed(data, t_ns):
-            scan = Scan.parse(frame)
-            if scan is not None and scan.count == len(self._bearing_rad) and scan.partial is None:
+            if frame.command != VALUES:
+                continue
+            try:
+                scan = Scan.parse(frame)
+            except DeviceProtocolError:
+                self.dropped[MALFORMED] += 1
+                continue
+            if scan.count == len(self._bearing_rad) and scan.partial is None:
                 self._on_frame(frame.t_first_ns)
                 self._take(frame, scan)
+            else:
+                self.dropped[OTHER_VARIANT] += scan.count
 
     def _take(self, frame: Frame, scan: Scan) -> None:
         stx_ns = self._stx_ns(frame, scan)

@@ -252,6 +252,8 @@ class Pipeline:
                     for part in results.entry(laser.name, laser.setup, laser.result)["coverage"]
                     if not part["done"]
                 }
+                if len(missing) == 360 // self._need.slice_deg:
+                    return "drive past the pole, within 7 m of it, from any side"
                 if missing:
                     return f"drive past the pole heading {headings(sorted(missing), self._need.slice_deg)}"
                 return "drive more passes of the pole, from all sides"

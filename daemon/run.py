@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import structlog
@@ -17,7 +19,7 @@ from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Recorder, RecorderError
 from polecal.daemon.replay import BEGIN, FINISH
 from polecal.daemon.routine import ENDED, State
-from polecal.daemon.sessions import Session, SessionError
+from polecal.daemon.sessions import Session
 from polecal.drivers.device import Device
 from polecal.drivers.errors import DeviceError, DeviceProtocolError
 from polecal.drivers.novatel_span import NovatelSpan
@@ -27,7 +29,16 @@ from polecal.drivers.sick_lms import SickLms
 _QUEUED_CHUNKS = 50_000  # minutes of both devices: a disk that stalls for longer stalls the readers
 _SYNC_S = 1.0
 
-_Item = tuple[str, Direction, int, bytes]
+_Chunk = tuple[str, Direction, int, bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class _End:
+    """Asks the engine to end the run: with what there is calibrated, as a fault, or just so."""
+
+    why: str
+    calibrate: bool = False
+    problem: PolecalError | None = None
 
 
 class Run:
@@ -39,7 +50,7 @@ class Run:
         """Set once the devices are left, the capture is closed and the result is written."""
         self._log = structlog.get_logger().bind(session=session.id)
         self._lock = threading.Lock()
-        self._queue: queue.Queue[_Item | str] = queue.Queue(_QUEUED_CHUNKS)
+        self._queue: queue.Queue[_Chunk | _End] = queue.Queue(_QUEUED_CHUNKS)
         self._problem: PolecalError | None = None
         self._pipeline = Pipeline(
             config,
@@ -109,12 +120,9 @@ class Run:
         for thread in (*self._threads, self._engine):
             thread.start()
 
-    def stop(self, why: str, *, calibrate: bool) -> None:
-        """End the run, with or without calibrating what there is; returns once all is closed."""
-        if calibrate:
-            self._queue.put(why)
-        else:
-            self._leave()
+    def stop(self, why: str, *, calibrate: bool = False, problem: PolecalError | None = None) -> None:
+        """End the run, also as a fault or with what there is calibrated; returns once all is closed."""
+        self._queue.put(_End(why, calibrate, problem))
         self.ended.wait()
 
     def status(self) -> dict[str, Any]:
@@ -124,15 +132,9 @@ class Run:
             since_ns = self._pipeline.routine.since_ns
             devices = [self._device(device) for device in self._devices]
         if self._problem is not None:
-            status["state"] = str(State.FAULT)
             status["notes"] = [str(self._problem), *status["notes"]]
         since_s = round((time.monotonic_ns() - since_ns) / 1e9, 1)
         return status | {"session": self.session.id, "since_s": since_s, "devices": devices}
-
-    def result(self) -> dict[str, Any] | None:
-        """Give the calibration as it stands, also before the end."""
-        with self._lock:
-            return self._pipeline.calibration()
 
     def _device(self, device: Device) -> dict[str, Any]:
         problem = device.problem
@@ -169,22 +171,43 @@ class Run:
                     synced_s = time.monotonic()
             except PolecalError as error:
                 self._fail(error)
+            except Exception as error:  # a bug: what comes in is still recorded, and the devices are left
+                self._log.exception("bug")
+                self._fail(
+                    PolecalError(f"a bug in polecal: {error!r}", "report it with the session's folder")
+                )
             if self.state in ENDED:
                 self._leave()
         self._close()
 
-    def _take(self, item: _Item | str) -> None:
-        if isinstance(item, str):
-            now_ns = time.monotonic_ns()
-            self._recorder.event(now_ns, {"event": FINISH, "why": item})
-            with self._lock:
-                self._pipeline.finish(now_ns, item)
+    def _take(self, item: _Chunk | _End) -> None:
+        if isinstance(item, _End):
+            self._end(item)
             return
         name, direction, t_ns, data = item
         self._recorder.write(name, direction, t_ns, data)
-        if direction == "rx":
+        if direction == "rx" and self._problem is None and self._pipeline.routine.running:
             with self._lock:
                 self._pipeline.feed(name, t_ns, data)
+                self._write_result()
+
+    def _end(self, end: _End) -> None:
+        if end.problem is not None:
+            self._fail(end.problem)
+        elif end.calibrate:
+            now_ns = time.monotonic_ns()
+            self._recorder.event(now_ns, {"event": FINISH, "why": end.why})
+            with self._lock:
+                self._pipeline.finish(now_ns, end.why)
+                self._write_result()
+        elif self._pipeline.routine.running:
+            self._pipeline.routine.to(State.IDLE, time.monotonic_ns(), end.why)
+
+    def _write_result(self) -> None:
+        """Write the result of a run that has just ended, before anybody can see that it has."""
+        calibration = self._pipeline.calibration() if self.state in (State.ACCEPTED, State.REJECTED) else None
+        if calibration is not None:
+            self.session.write_calibration(calibration)
 
     def _store(self, laser: str, stored: StoredPass) -> None:
         self._recorder.sync()
@@ -199,6 +222,8 @@ class Run:
         if self._problem is None:
             self._log.error("run failed", problem=str(error), hint=error.hint)
             self._problem = error
+            with contextlib.suppress(RecorderError):  # which may be what failed
+                self._pipeline.routine.to(State.FAULT, time.monotonic_ns(), str(error))
         self._leave()
 
     def _leave(self) -> None:
@@ -211,11 +236,8 @@ class Run:
 
     def _close(self) -> None:
         try:
-            calibration = self.result()
-            if self.state in (State.ACCEPTED, State.REJECTED) and calibration is not None:
-                self.session.write_calibration(calibration)
             self._recorder.close()
-        except (RecorderError, SessionError) as error:
+        except RecorderError as error:
             self._fail(error)
         self.ended.set()
 

@@ -18,7 +18,7 @@ from polecal.daemon import log, sessions
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, code_of
 from polecal.daemon.recorder import RecorderError
-from polecal.daemon.routine import State
+from polecal.daemon.routine import ENDED, State
 from polecal.daemon.run import Run, joined, silent
 
 _START_S = 120.0  # every rate of every device tried twice, and an EEPROM written
@@ -52,7 +52,7 @@ class Service:
     def close(self) -> None:
         """End what runs, and leave the devices polite."""
         if self._run is not None:
-            self._run.stop("the daemon is stopped", calibrate=False)
+            self._run.stop("the daemon is stopped")
 
     def _start(self, name: str | None, *, force: bool) -> dict[str, Any]:
         if not self._starting.acquire(blocking=False):
@@ -62,13 +62,13 @@ class Service:
         try:
             current = self._run
             if current is not None and not current.ended.is_set():
-                if not force:
+                if current.state not in ENDED and not force:
                     raise Refused(
                         f"session {current.session.id} is running",
                         "stop it by `polecal-field stop`, or start with --force",
                         Code.BUSY,
                     )
-                current.stop("another session was started", calibrate=False)
+                current.stop("another session was started")
             run = Run(self._config, sessions.create(self._config.state_dir, self._config, name))
             run.begin()
             self._run = run
@@ -89,7 +89,7 @@ class Service:
         if not missing:
             return
         problem = joined([device.problem or silent(device) for device in missing])
-        run.stop("not all devices stream", calibrate=False)
+        run.stop("not all devices stream", problem=problem)
         raise problem
 
     def _status(self) -> dict[str, Any]:
@@ -137,9 +137,7 @@ def main(argv: list[str] | None = None) -> int:
         log.configure()
         return _serve(config)
     except PolecalError as error:
-        print(
-            f"polecald: {error}", *([f"hint: {error.hint}"] if error.hint else []), sep="\n", file=sys.stderr
-        )  # noqa: T201
+        sys.stderr.write(f"polecald: {error}\n" + (f"hint: {error.hint}\n" if error.hint else ""))
         return code_of(error)
 
 

@@ -131,6 +131,13 @@ def test_a_scan_on_request(ready, known):
     assert ready.listen(1.0) == b""
 
 
+def test_a_partial_scan_on_request_has_the_whole_half_circle(ready, known):
+    reply = ready.ask(known("30h 08"), 2.0)
+    (scan,) = scans(reply[1:])
+    assert len(words(scan)) in (180, 181)
+    assert scan[6] & 0x20
+
+
 # --- state
 
 
