@@ -21,6 +21,7 @@ _REVOLUTION_BYTES = 508  # leave in one turn at 500000 bit/s (section 6)
 _GAP_NS = 6_000_000  # between a telegram's bytes; after more, it is forgotten (section 1)
 _RESET_NS = 10_000_000
 _FULL_RATE = 500000
+_ALL_ONCE, _PARTIAL_ONCE = b"\x01", b"\x08"  # what 30h may ask for
 _PARTIALS = 4  # quarter degrees that an interlaced scan goes through
 
 
@@ -165,9 +166,10 @@ class EmulatedLaser(EmulatedDevice):
         if code == Command.RESET and not data:
             self._at(t_ns + self._ack_ns + _RESET_NS, self._reset)
             return
-        if code == Command.VALUES and data == b"\x01":
-            end = self._end_from(t_ns + self._ack_ns, self.variant.revolutions)
-            self._at(self._moment_ns(end), lambda now_ns: self._reply_values(now_ns, end))
+        if code == Command.VALUES and data in (_ALL_ONCE, _PARTIAL_ONCE):
+            partial = data == _PARTIAL_ONCE
+            end = self._end_from(t_ns + self._ack_ns, 1 if partial else self.variant.revolutions)
+            self._at(self._moment_ns(end), lambda _: self._reply_values(end, partial=partial))
             return
         answer = self._ANSWERS[code](self, data) if code in self._ANSWERS else _REJECTED
         ready_ns = t_ns + max(self._ack_ns, round(answer.delay_s * 1e9))
@@ -190,14 +192,14 @@ class EmulatedLaser(EmulatedDevice):
 
     def _set_mode(self, data: bytes) -> _Answer:
         sub = data[0] if data else -1
-        done, refused = _Answer(REPLY_MODE, b"\x00"), _Answer(REPLY_MODE, b"\x01")
+        done, refused = _Answer(lms.MODE_REPLY, b"\x00"), _Answer(lms.MODE_REPLY, b"\x01")
         if sub == Mode.INSTALLATION:
             if data[1:] != lms.PASSWORD:
                 return refused
         elif len(data) != 1:
             return refused
         elif sub in lms.BAUD_OF_SUB:
-            return _Answer(REPLY_MODE, b"\x00", then_baud=lms.BAUD_OF_SUB[sub])
+            return _Answer(lms.MODE_REPLY, b"\x00", then_baud=lms.BAUD_OF_SUB[sub])
         elif sub == Mode.STREAM_PARTIAL:
             if self.variant != Variant(100, 25):
                 return refused
@@ -316,10 +318,10 @@ class EmulatedLaser(EmulatedDevice):
         """Send the scan that is complete now, unless the line is not done with the one before."""
         end, self._next_end = self._next_end, self._next_end + self._scan_revolutions
         if self._line.busy_until_ns <= t_ns:
-            self._send_paced(end, self._scan(end))
+            self._send_paced(end, self._scan(end, partial=self.mode == Mode.STREAM_PARTIAL))
 
-    def _reply_values(self, _: int, end: int) -> None:
-        self._send_paced(end, self._scan(end))
+    def _reply_values(self, end: int, *, partial: bool) -> None:
+        self._send_paced(end, self._scan(end, partial=partial))
         self._resume(self._line.busy_until_ns)
 
     def _send_paced(self, revolution: int, data: bytes) -> None:
@@ -330,16 +332,19 @@ class EmulatedLaser(EmulatedDevice):
         for i, start in enumerate(range(0, len(data), step)):
             self._line.send(self._moment_ns(revolution + i), data[start : start + step])
 
-    def _scan(self, end: int) -> bytes:
-        """Return the B0 of the scan that is complete when turn ``end`` begins."""
-        turns = self._scan_revolutions
+    def _scan(self, end: int, *, partial: bool) -> bytes:
+        """Return the B0 of the scan that is complete when turn ``end`` begins.
+
+        A partial one is that turn's 1° raster alone, over the whole half circle whatever the variant.
+        """
+        turns = 1 if partial else self.variant.revolutions
         first = end - turns
-        partial = first % _PARTIALS if self.mode == Mode.STREAM_PARTIAL else None
+        quarter = first % _PARTIALS if partial else None
         angle_deg: Floats
-        if partial is None:
+        if quarter is None:
             angle_deg = self.variant.angles_deg
-        else:  # each turn's 1° raster at once, over the whole half circle whatever the variant
-            angle_deg = np.arange(181.0 if partial == 0 else 180.0) + partial / _PARTIALS
+        else:
+            angle_deg = np.arange(181.0 if quarter == 0 else 180.0) + quarter / _PARTIALS
         # Beam i is measured in turn i mod the scan's turns, when the mirror is at its angle (section 6)
         turn = first + np.arange(len(angle_deg)) % turns
         fired_ns = self._t0_ns + np.rint((turn + angle_deg / 360) * self._revolution_ns).astype(np.int64)
@@ -353,10 +358,7 @@ class EmulatedLaser(EmulatedDevice):
             lms.value_words(range_m, level, self.config),
             self.config,
             (end, self._telegrams),
-            partial=partial,
+            partial=quarter,
             address=self._address,
             status=self._status(),
         )
-
-
-REPLY_MODE = Command.MODE + lms.REPLY

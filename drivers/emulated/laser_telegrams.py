@@ -41,6 +41,7 @@ class Command(IntEnum):
 POWER_ON = 0x90
 RESET_DONE = 0x91
 REJECTED = 0x92
+MODE_REPLY = 0xA0
 VALUES_REPLY = 0xB0
 
 

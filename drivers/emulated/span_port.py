@@ -23,6 +23,7 @@ _INVALID_BAUD = (35, "Invalid baud rate")
 _MISSING_FIELD = (9, "Missing field")
 
 _LONGEST_LINE = 1024
+_LONGEST_FRAME = 512  # that a host may send: no command is longer
 _PORT = re.compile(r"(COM\d|USB\d|I?NCOM\d|ICOM\d|AUX|ETH1|FILE|SPECIAL|THISPORT|ALL_PORTS)(_ALL)?")
 _OURS = ("COM1", "COM1_ALL", "THISPORT", "THISPORT_ALL", "ALL_PORTS")
 _TAKEN_AS_SAID = re.compile(
@@ -69,7 +70,9 @@ class SpanPort(EmulatedDevice):
         self._heard.append(byte)
         while self._heard:
             size = span.frame_size(self._heard)
-            if size == 0:
+            if size is not None and size > _LONGEST_FRAME:
+                del self._heard[0]
+            elif size == 0:
                 ends = [end for end in (self._heard.find(b"\r"), self._heard.find(b"\n")) if end >= 0]
                 if not ends:
                     del self._heard[:-_LONGEST_LINE]
