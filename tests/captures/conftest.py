@@ -29,8 +29,8 @@ class DrivenRig:
     true: MountPose = TRUE
 
 
-def driven_rig(path: Path, t0_ns: int, start_ns: int) -> DrivenRig:
-    """Both devices, just powered up; the recording and its path begin at ``start_ns``.
+def driven_rig(path: Path, t0_ns: int) -> DrivenRig:
+    """Both devices, just powered up; the recording and its path begin once a log is asked for.
 
     The recording has no line: a chunk is there at once when it was received over the network. On a serial
     line its bytes take their time, which the host takes off, so the path is laid that much earlier.
@@ -39,10 +39,9 @@ def driven_rig(path: Path, t0_ns: int, start_ns: int) -> DrivenRig:
     trajectory, reference = recorded_path(data, offsets, arrival_s)
     trajectory.t_s = trajectory.t_s - _POSE_BYTES * 10 / BAUD
     world = World(trajectory, mount=TRUE, pole_ne_m=POLE_NE_M, reference=reference, seed=1)
-    world.start(start_ns)
     return DrivenRig(
-        laser=EmulatedLaser(world, t0_ns=t0_ns, seed=1),
-        receiver=PlaybackReceiver(data, offsets, arrival_s, t0_ns=t0_ns, start_ns=start_ns, baud=BAUD),
+        laser=EmulatedLaser(world, t0_ns=t0_ns, seed=1, starts_world=False),
+        receiver=PlaybackReceiver(data, offsets, arrival_s, t0_ns=t0_ns, baud=BAUD, on_start=world.start),
         seconds=arrival_s[-1] - arrival_s[0],
     )
 
