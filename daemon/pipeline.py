@@ -252,10 +252,14 @@ class Pipeline:
                     for part in results.entry(laser.name, laser.setup, laser.result)["coverage"]
                     if not part["done"]
                 }
-                if len(missing) == 360 // self._need.slice_deg:
+                every, width = set(range(360 // self._need.slice_deg)), self._need.slice_deg
+                if missing == every:
                     return "drive past the pole, within 7 m of it, from any side"
+                if len(missing) > len(every) / 2:
+                    seen = headings(sorted(every - missing), width)
+                    return f"drive past the pole from any side but heading {seen}"
                 if missing:
-                    return f"drive past the pole heading {headings(sorted(missing), self._need.slice_deg)}"
+                    return f"drive past the pole heading {headings(sorted(missing), width)}"
                 return "drive more passes of the pole, from all sides"
             case _:
                 return ""
@@ -264,7 +268,8 @@ class Pipeline:
         notes = []
         if self.routine.state is State.ALIGNING:
             if self._ins_status is not InsStatus.INS_SOLUTION_GOOD:
-                notes.append(f"navigation says {_named(self._ins_status)}: nothing is used before it is good")
+                meaning = getattr(self._ins_status, "meaning", "nothing is used before it is good")
+                notes.append(f"navigation says {_named(self._ins_status)}: {meaning}")
             elif not self._clock.locked:
                 notes.append("the receiver's clock is being learnt")
         return notes
