@@ -62,19 +62,24 @@ class _Parser(argparse.ArgumentParser):
         sys.exit(Code.USAGE)
 
 
+def _common() -> _Parser:
+    """Make the options that may stand before the verb and after it."""
+    common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
+    common.add_argument("--socket", type=Path, metavar="PATH", help=f"the daemon's, else {_SOCKET}")
+    common.add_argument("--json", action="store_true", help="print what the daemon says, as it is")
+    return common
+
+
 def _parser() -> argparse.ArgumentParser:
-    shared = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
-    shared.add_argument("--socket", type=Path, metavar="PATH", help=f"the daemon's, else {_SOCKET}")
-    shared.add_argument("--json", action="store_true", help="print what the daemon says, as it is")
     about = "Calibrate the pose of a vehicle's laser in the field."
-    parser = _Parser(prog="polecal-field", description=about, parents=[shared])
+    parser = _Parser(prog="polecal-field", description=about, parents=[_common()])
     parser.set_defaults(socket=Path(os.environ.get("POLECAL_SOCKET") or _SOCKET), json=False)
     parser.add_argument("--version", action="version", version=__version__)
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
     def verb(run: Callable[[argparse.Namespace], int], about: str) -> _Parser:
         name = run.__name__.strip("_")
-        made = verbs.add_parser(name, parents=[shared], help=about, description=about.capitalize() + ".")
+        made = verbs.add_parser(name, parents=[_common()], help=about, description=about.capitalize() + ".")
         made.set_defaults(run=run)
         return made
 
@@ -294,12 +299,12 @@ def _decode(arguments: argparse.Namespace) -> int:
                 reason = item.reason.value if isinstance(item.reason, Enum) else item.reason
                 _print_json({"frame": None, "name": "garbage", **where, "reason": reason})
         skips.clear()
+        sys.stdout.flush()  # a live stream is read as it comes
 
     with _opened(arguments.file) as stream:
         while data := stream.read1(_DECODE_BYTES):
             put(framer.feed(data, 0))
     put(framer.close() or [])
-    sys.stdout.flush()
     return 0
 
 
