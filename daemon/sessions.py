@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import IO, Any
 
@@ -87,8 +88,11 @@ def create(state_dir: Path, config: Config, name: str | None) -> Session:
     """Make a new session's folder. Raises SessionError."""
     now = datetime.now(UTC)
     label = name or "-".join(laser.name for laser in config.lasers)
-    folder = state_dir / "sessions" / f"{now:%Y%m%dT%H%M%SZ}-{label}"
+    folder = first = state_dir / "sessions" / f"{now:%Y%m%dT%H%M%SZ}-{label}"
+    others = count(2)
     try:
+        while folder.exists():  # one that was started, and failed, within the same second
+            folder = first.with_name(f"{first.name}-{next(others)}")
         (folder / "passes").mkdir(parents=True)
     except OSError as error:
         raise SessionError(
@@ -131,7 +135,8 @@ def _whole_file(path: Path) -> Iterator[IO[bytes]]:
         finally:
             os.close(folder)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
         raise SessionError(
             f"{path}: cannot be written: {error.strerror}", "make room on the disk, then start again"
         ) from error
