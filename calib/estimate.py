@@ -16,7 +16,7 @@ from polecal.calib.coverage import Need, Slice, coverage, slice_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
 from polecal.calib.observations import PARAMETERS, CalibrationError, Kind, Mount, Returns, axis_shift_m
-from polecal.calib.solve import Scatter
+from polecal.calib.solve import UNKNOWNS, Scatter
 from polecal.calib.uncertainty import FEWEST_PASSES, from_model, jackknife
 
 MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
@@ -24,6 +24,7 @@ MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
 
 _LAST_PASSES = 3  # the rate of improvement is what these brought
 _FEWEST_POLE_RETURNS = 10
+_TELLING_S = 2e-3  # a time offset known no better than this, 1 cm at 5 m/s, is not told from x
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,8 @@ class Setup:
     pole_radius_m: float = 0.0
     pass_error: bool = True
     """Whether each pass may have a navigation error of its own, which weighs it down; else Eq. 7 as it is."""
+    time_offset: bool = True
+    """Whether to look for a constant offset between the laser's time and the navigation's."""
     hold: frozenset[str] = frozenset()
     criteria: Criteria = field(default_factory=Criteria)
     need: Need = field(default_factory=Need)
@@ -62,12 +65,16 @@ class Result:
     """A mount, and how far to trust it.
 
     ``sigma`` has the same names and units as the mount; of what is ``held`` it is the hand measurement's.
+    ``time_offset_s`` is by how much later than its stamps say the laser measured; it is 0 and its σ None
+    where it was not looked for, or could not be told from x.
     ``covariance`` is (6, 6) in m and rad, order `PARAMETERS`. Costs are √c of Eq. 7 in m, after pole
     returns were moved to the pole's axis. ``improvement`` is by how much of itself √c over all data fell
     through the last passes, or None before there are enough.
     """
 
     mount: Mount
+    time_offset_s: float
+    time_offset_sigma_s: float | None
     cost_m: float
     measured_cost_m: float
     sigma: Mount
@@ -102,6 +109,7 @@ def calibrate(
     pole_radius_m: float = 0.0,
     *,
     pass_error: bool = False,
+    time_offset: bool = False,
     measured_sigma: Mount = MEASURED_SIGMA,
     hold: Collection[str] = (),
     criteria: Criteria | None = None,
@@ -119,6 +127,8 @@ def calibrate(
         0 is the paper's cost to the letter; else pole returns are moved to the pole's axis.
     pass_error
         Let each pass have a navigation error of its own: not the paper's cost, and nearer to the truth.
+    time_offset
+        Solve for a constant offset in time, too; needs the returns' velocity and rate.
     measured_sigma
         What the hand measurement is worth: a parameter is held where the data know it no better.
     hold
@@ -137,7 +147,14 @@ def calibrate(
         for number in np.unique(returns.pass_id)
     ]
     setup = Setup(
-        mount, measured_sigma, pole_radius_m, pass_error, frozenset(hold), criteria or Criteria(), need
+        measured=mount,
+        measured_sigma=measured_sigma,
+        pole_radius_m=pole_radius_m,
+        pass_error=pass_error,
+        time_offset=time_offset and returns.velocity_mps is not None and returns.rate_radps is not None,
+        hold=frozenset(hold),
+        criteria=criteria or Criteria(),
+        need=need,
     )
     return estimate(passes, setup, everywhere=True)
 
@@ -147,9 +164,9 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
 
     Raises CalibrationError where there are fewer than 10 pole returns.
     """
-    shift_m = axis_shift_m(setup.pole_radius_m)
-    pole = Scatter([one.total(Kind.POLE).at(shift_m, 0.0) for one in passes], axes=(0, 1))
-    ground = Scatter([one.total(Kind.GROUND).at(0.0, 0.0) for one in passes], axes=(2,))
+    poles, grounds = ([one.total(kind) for one in passes] for kind in (Kind.POLE, Kind.GROUND))
+    pole = Scatter(poles, axes=(0, 1), shift_m=axis_shift_m(setup.pole_radius_m), ranged=True)
+    ground = Scatter(grounds, axes=(2,))
     returns = {Kind.POLE: int(pole.count.sum()), Kind.GROUND: int(ground.count.sum())}
     if returns[Kind.POLE] < _FEWEST_POLE_RETURNS:
         raise CalibrationError(
@@ -163,18 +180,18 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
         return pole.form(used, ratios[0]) + ground.form(used, ratios[1])
 
     paper_q = q = form(every)  # Eq. 7
-    measured = setup.measured.vector
+    measured = np.concatenate([setup.measured.vector, [0.0, 0.0]])
+    held = {*setup.hold, "range"} | (set() if setup.time_offset else {"time"})
     if setup.pass_error and len(passes) >= FEWEST_PASSES:
-        rough = solve.minimise(q, measured, setup.hold)
+        rough = solve.minimise(q, measured, held)
         ratios = pole.ratio(rough), ground.ratio(rough)
         q = form(every)
     without = [form(every & (np.arange(len(passes)) != index)) for index in range(len(passes))]
-    measured_sigma = setup.measured_sigma.vector
+    measured_sigma = np.concatenate([setup.measured_sigma.vector, [_TELLING_S, np.inf]])
     # What the data know no better than the tape measure is not taken from them. On a flat pad z is nearly
     # free (paper.md, later work 4) and more passes hardly help: it must meet its own bound, or is held.
     believable = measured_sigma.copy()
     believable[2] = min(believable[2], setup.criteria.max_sigma[2])
-    held = set(setup.hold)
     vector = measured
     while True:
         search = solve.minimise_globally if everywhere else solve.minimise
@@ -197,9 +214,11 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
         worst = int(np.argmax(doubt))
         if doubt[worst] <= 1.0:
             break
-        held.add(PARAMETERS[worst])
-    mask = _mask(held)
-    covariance[mask, mask] = measured_sigma[mask] ** 2
+        held.add(UNKNOWNS[worst])
+    mask = _mask(held)[:6]
+    time_sigma_s = float(np.sqrt(covariance[6, 6]))
+    covariance = covariance[:6, :6]
+    covariance[mask, mask] = measured_sigma[:6][mask] ** 2
     sigma = np.sqrt(np.diag(covariance))
     cost_m = solve.cost_m(paper_q, vector)
     improvement = None
@@ -216,11 +235,13 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
         improvement=improvement,
         sigma=sigma,
         held=tuple(held),
-        shift=vector - measured,
-        measured_sigma=measured_sigma,
+        shift=(vector - measured)[:6],
+        measured_sigma=measured_sigma[:6],
     )
     return Result(
-        mount=Mount.from_vector(vector),
+        mount=Mount.from_vector(vector[:6]),
+        time_offset_s=float(vector[6]),
+        time_offset_sigma_s=None if "time" in held else time_sigma_s,
         cost_m=cost_m,
         measured_cost_m=solve.cost_m(paper_q, measured),
         sigma=Mount.from_vector(sigma),
@@ -235,4 +256,4 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
 
 
 def _mask(held: Collection[str]) -> NDArray[np.bool_]:
-    return np.array([name in held for name in PARAMETERS])
+    return np.array([name in held for name in UNKNOWNS])

@@ -23,16 +23,17 @@ import numpy as np
 from polecal.calib.geometry import Array, rotation, skew
 from polecal.calib.observations import Returns
 
-BASE = 10
-"""Length of h."""
+BASE = slice(0, 10)
+RANGE = slice(10, 16)
+TIME = slice(16, 26)
+"""Where in h⁺ are h, the part that a range offset scales, and the part that a time offset scales."""
 WIDTH = 26
-"""Length of h⁺."""
 _BLOCK = 8192  # returns at once: 5 MB of features, which stay in the cache's reach
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Sums over returns of one kind: how many, Σ f (3 * width,) and Σ f fᵀ, f axis by axis of n (m)."""
+    """Sums over returns of one kind: how many, Σ f (78,) and Σ f fᵀ (78, 78), f axis by axis of n (m)."""
 
     count: int
     first: Array
@@ -44,29 +45,19 @@ class Moments:
     def __sub__(self, other: Moments) -> Moments:
         return Moments(self.count - other.count, self.first - other.first, self.second - other.second)
 
-    def at(self, range_offset_m: float, time_offset_s: float) -> Moments:
-        """Put in a range and a time offset: moments of 3 × 10 features are left, of h alone."""
-        fold = np.zeros((WIDTH, BASE))
-        fold[:BASE] = np.eye(BASE)
-        fold[10:16, :6] = range_offset_m * np.eye(6)
-        fold[16:] = time_offset_s * np.eye(BASE)
-        three = np.kron(np.eye(3), fold)
-        return Moments(self.count, self.first @ three, three.T @ self.second @ three)
-
     def mean(self, axis: int) -> Array:
-        """Give the (width,) mean of the features of one axis of n: mean = m h, m."""
-        return self.first[self._part(axis)] / max(1, self.count)
+        """Give the (26,) mean of the features of one axis of n: mean = m h⁺, m."""
+        return self.first[_of(axis)] / max(1, self.count)
 
     def covariance(self, axis: int) -> Array:
-        """Give the (width, width) covariance of the features of one axis of n: var = hᵀ S h, m²."""
-        part = self._part(axis)
+        """Give the (26, 26) covariance of the features of one axis of n: var = h⁺ᵀ S h⁺, m²."""
         mean = self.mean(axis)
-        covariance = self.second[part, part] / max(1, self.count) - np.outer(mean, mean)
+        covariance = self.second[_of(axis), _of(axis)] / max(1, self.count) - np.outer(mean, mean)
         return (covariance + covariance.T) / 2
 
-    def _part(self, axis: int) -> slice:
-        width = len(self.first) // 3
-        return slice(axis * width, (axis + 1) * width)
+
+def _of(axis: int) -> slice:
+    return slice(axis * WIDTH, (axis + 1) * WIDTH)
 
 
 def zero() -> Moments:
@@ -92,15 +83,12 @@ def _features(returns: Returns) -> Array:
     sin = np.sin(returns.bearing_rad)[:, None, None]
     r = returns.range_m[:, None, None]
     features = np.zeros((n, 3, WIDTH))
-    features[:, :, 10:13] = cos * c
-    features[:, :, 13:16] = sin * c
-    features[:, :, 0:6] = r * features[:, :, 10:16]
-    features[:, :, 6:9] = c
-    features[:, :, 9] = returns.position_m
+    base, ranged, timed = (features[:, :, part] for part in (BASE, RANGE, TIME))
+    ranged[:, :, :3], ranged[:, :, 3:] = cos * c, sin * c
+    base[:, :, :6] = r * ranged
+    base[:, :, 6:9], base[:, :, 9] = c, returns.position_m
     if returns.velocity_mps is not None and returns.rate_radps is not None:
         turn = c @ skew(returns.rate_radps)  # Ċ
-        features[:, :, 16:19] = r * cos * turn
-        features[:, :, 19:22] = r * sin * turn
-        features[:, :, 22:25] = turn
-        features[:, :, 25] = returns.velocity_mps
+        timed[:, :, :3], timed[:, :, 3:6] = r * cos * turn, r * sin * turn
+        timed[:, :, 6:9], timed[:, :, 9] = turn, returns.velocity_mps
     return features

@@ -16,24 +16,25 @@ FEWEST_PASSES = 4
 
 
 def jackknife(left_out: Array) -> Array:
-    """Give the covariance (6, 6) of the whole, from (P, 6) solutions each without one of P passes.
+    """Give the covariance (n, n) of the whole, from (P, n) solutions each without one of P passes.
 
-    Units m and rad. Tukey's (P-1)/P Σ d dᵀ, d from the mean; angles are compared the short way round.
+    Tukey's (P-1)/P Σ d dᵀ, d from the mean; unknowns 3 to 5 are angles in rad, compared the short way
+    round.
     """
     spread = left_out - left_out[0]
-    spread[:, 3:] = wrap(spread[:, 3:])
+    spread[:, 3:6] = wrap(spread[:, 3:6])
     spread -= spread.mean(axis=0)
     covariance: Array = (len(left_out) - 1) / len(left_out) * spread.T @ spread
     return covariance
 
 
 def from_model(information: Array, cost: float, observations: int, free: NDArray[np.bool_]) -> Array:
-    """Give the covariance (6, 6) that so many independent observations of variance ``cost`` (m²) allow.
+    """Give the covariance (n, n) that so many independent observations of variance ``cost`` (m²) allow.
 
-    Of the ``free`` parameters only, m and rad; ``information`` is `solve.information`. What the data say
+    Of the ``free`` parameters only, ``information`` (n, n) is `solve.information`. What the data say
     nothing about comes out with a huge variance, where a scatter would come out as nothing.
     """
-    covariance = np.zeros((6, 6))
+    covariance = np.zeros_like(information)
     values, vectors = np.linalg.eigh(information[np.ix_(free, free)])
     floor = max(values.max(initial=0.0), 1e-12) * 1e-12
     inverse = vectors @ np.diag(1.0 / np.maximum(values, floor)) @ vectors.T

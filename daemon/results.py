@@ -88,7 +88,8 @@ def calibration(name: str, setup: Setup, result: Result, session: str, created: 
         "matrix": matrix.tolist(),
         "covariance": result.covariance.tolist(),
         "returns": {kind.name.lower(): result.returns[kind] for kind in Kind},
-        "time_offset_s": 0.0,
+        "time_offset_s": result.time_offset_s,
+        "time_offset_sigma_s": result.time_offset_sigma_s,
         "session": session,
         "created": created,
     }

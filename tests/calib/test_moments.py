@@ -14,10 +14,11 @@ def returns(rig):
     return rig.drive(noise_m=0.01, nav_m=0.01, passes=8)
 
 
-def form(pole, ground):
-    """Eq. 7 of one pass."""
+def cost_from_moments(pole, ground, mount, *, radius_m=0.0, time_s=0.0):
+    """√c of Eq. 7 of one pass."""
     every = np.array([True])
-    return Scatter([pole], (0, 1)).form(every) + Scatter([ground], (2,)).form(every)
+    q = Scatter([pole], (0, 1), shift_m=np.pi / 4 * radius_m, ranged=True).form(every)
+    return cost_m(q + Scatter([ground], (2,)).form(every), np.array([*mount.vector, time_s, 0.0]))
 
 
 def split(returns):
@@ -29,8 +30,8 @@ def split(returns):
 @pytest.mark.parametrize("radius_m", [0.0, 0.05])
 def test_cost_from_moments_is_the_cost_of_the_cloud(returns, mount, radius_m):
     pole, ground = split(returns)
-    q = form(pole.at(np.pi / 4 * radius_m, 0.0), ground.at(0.0, 0.0))
-    assert cost_m(q, mount.vector) == pytest.approx(cost(returns, mount, radius_m), rel=1e-9)
+    told = cost_from_moments(pole, ground, mount, radius_m=radius_m)
+    assert told == pytest.approx(cost(returns, mount, radius_m), rel=1e-9)
 
 
 def test_moments_of_parts_add_up_and_come_off_again(returns):
@@ -50,7 +51,7 @@ def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):
     velocity, rate = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
     moving = replace(returns, velocity_mps=velocity, rate_radps=rate)
     pole, ground = split(moving)
-    told = cost_m(form(pole.at(0.0, tau), ground.at(0.0, tau)), rig.true.vector)
+    told = cost_from_moments(pole, ground, rig.true, time_s=tau)
     body = np.einsum(
         "nij,nj->ni",
         rotation(returns.rpy_rad).transpose(0, 2, 1),
@@ -66,4 +67,4 @@ def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):
 
 def test_no_returns_cost_nothing():
     assert m.zero().count == 0
-    assert not m.zero().at(0.0, 0.0).covariance(0).any()
+    assert not m.zero().covariance(0).any()
