@@ -1,4 +1,4 @@
-"""The LMS-291's telegrams, as the device builds them: state in, bytes out.
+"""The LMS2xx's telegrams as the device frames them, and its status reply: state in, bytes out.
 
 Numbers are those of the protocol sheet; section numbers refer to it.
 """
@@ -6,7 +6,7 @@ Numbers are those of the protocol sheet; section numbers refer to it.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -29,11 +29,17 @@ class Command(IntEnum):
     STATUS = 0x31
     ERRORS = 0x32
     HOURS = 0x35
+    MEAN = 0x36
+    SUB_RANGE = 0x37
     TYPE = 0x3A
     VARIANT = 0x3B
+    MEAN_SUB_RANGE = 0x3F
+    FIELD_SET = 0x41
+    S14_REFLECTIVITY = 0x44
     OUTPUTS = 0x4A
     PERMANENT = 0x66
     READ_CONFIG = 0x74
+    ENERGY = 0x75
     WRITE_CONFIG = 0x77
     READ_CONFIG_2 = 0x7B
 
@@ -41,18 +47,24 @@ class Command(IntEnum):
 POWER_ON = 0x90
 RESET_DONE = 0x91
 REJECTED = 0x92
-MODE_REPLY = 0xA0
-VALUES_REPLY = 0xB0
 
 
 class Mode(IntEnum):
-    """Operating modes, the byte after 20h."""
+    """Operating modes, the byte after 20h (section 3, 20h sub-modes)."""
 
     INSTALLATION = 0x00
     DIAGNOSTIC = 0x10
+    MIN_ON_OBJECT = 0x21
+    VERTICAL_ON_OBJECT = 0x23
     STREAM = 0x24
     REQUEST = 0x25
+    STREAM_MEAN = 0x26
+    STREAM_SUB_RANGE = 0x27
+    STREAM_MEAN_SUB_RANGE = 0x28
     STREAM_PARTIAL = 0x2A
+    STREAM_ENERGY = 0x2B
+    STREAM_SEGMENTS = 0x2C
+    STREAM_S14 = 0x50
 
 
 BAUD_OF_SUB = {0x40: 38400, 0x41: 19200, 0x42: 9600, 0x48: 500000}
@@ -61,6 +73,8 @@ PASSWORD = b"SICK_LMS"
 
 STATUS_OK = 0x10
 """Type 6, no error (section 1)."""
+_RESTART, _IMPLAUSIBLE, _POLLUTED = 1 << 5, 1 << 6, 1 << 7
+_PAST = 0x80  # added to an error's type
 
 DEFAULT_CONFIG = bytes.fromhex(
     "0000 46 00 00 00 00 00 00 02 02 02 00 000A0A5064 000A0A5064 000A0A5064 00 00 0000 0200"
@@ -70,14 +84,17 @@ DEFAULT_CONFIG = bytes.fromhex(
 STREAM_CONFIG = DEFAULT_CONFIG[:4] + b"\x02\x01" + DEFAULT_CONFIG[6:]
 """Real-time indices on, measuring mode 01: reflectivity in bits 13 to 15."""
 
+SENSITIVITY, AVAILABILITY, MEASURING_MODE, UNIT, EVALUATIONS, RESTART_MODE, RESTART_TIME = (
+    3,
+    4,
+    5,
+    6,
+    9,
+    10,
+    11,
+)
+"""Offsets in the configuration (section 3.2)."""
 INDICES = 0x02  # availability bit 1
-_AVAILABILITY, _MEASURING_MODE, _UNIT = 4, 5, 6
-
-_DISTANCE_BITS = {0x00: 13, 0x01: 13, 0x02: 13, 0x03: 14, 0x04: 14, 0x05: 15, 0x06: 15, 0x0F: 15}
-_LEVEL_BITS = {0x01: 3, 0x03: 2, 0x05: 1}
-MEASURING_MODES = frozenset(_DISTANCE_BITS)
-
-_NO_ECHO, _OVER_MAXIMUM = 0, 8  # below the largest number of the distance bits (overflow codes, 3.3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +111,8 @@ class Variant:
 
     @property
     def revolutions(self) -> int:
-        """How many turns of the mirror a scan takes: each fires a 1° raster."""
-        return 100 // self.resolution_cdeg
+        """How many turns of the mirror a scan takes: each fires a 1° raster, the S14's a 0.5° one."""
+        return 1 if self == S14_VARIANT else 100 // self.resolution_cdeg
 
     @property
     def angles_deg(self) -> NDArray[np.float64]:
@@ -103,9 +120,9 @@ class Variant:
         return (180 - self.angle_deg) / 2 + np.arange(self.beams) * self.resolution_cdeg / 100
 
 
-POWER_ON_VARIANT = Variant(180, 50)
-VARIANTS = frozenset(Variant(a, r) for a, r in ((180, 100), (180, 50), (100, 100), (100, 50), (100, 25)))
-"""Section 7."""
+S14_VARIANT = Variant(90, 50)
+INTERLACED = Variant(100, 25)
+"""To which a laser must be set before it streams partial scans (section 7)."""
 
 
 def crc16(data: bytes) -> int:
@@ -128,41 +145,65 @@ def reply(code: int, data: bytes, status: int = STATUS_OK, address: int = 0) -> 
     return telegram(REPLY + address, bytes([code]) + data + bytes([status]))
 
 
-def value_words(range_m: NDArray[np.float64], level: NDArray[np.int64], config: bytes) -> NDArray[np.uint16]:
-    """Return ranges (N,) m, inf for no echo, and reflectivity levels 0 to 7 as value words (section 3.3)."""
-    mode, per_metre = config[_MEASURING_MODE], 1000 if config[_UNIT] else 100
-    bits = _DISTANCE_BITS[mode]
-    top = (1 << bits) - 1
-    seen = np.isfinite(range_m)
-    distance = np.rint(np.where(seen, range_m, 0.0) * per_metre).clip(0, top - _OVER_MAXIMUM)
-    distance = np.where(seen, distance, top - _NO_ECHO).astype(np.uint16)
-    level_bits = _LEVEL_BITS.get(mode, 0)
-    if level_bits:
-        distance |= np.where(seen, level >> (3 - level_bits), 0).astype(np.uint16) << np.uint16(bits)
-    return distance
+_POLLUTION = (402, 282, 479, 667, 375, 273, 449, 326)
+_REFERENCE_POLLUTION = (432, 338, 421, 402)
 
 
-def values(
-    words: NDArray[np.uint16],
-    config: bytes,
-    indices: tuple[int, int],
-    *,
-    partial: int | None = None,
-    address: int = 0,
-    status: int = STATUS_OK,
-) -> bytes:
-    """Return B0 of value words in ascending angle.
+@dataclass(frozen=True, slots=True)
+class Health:
+    """How the device is, which no telegram of the host's changes; all of it is the emulation's to say."""
 
-    ``indices`` are the mirror's revolution and the telegram, put in if the configuration says so;
-    ``partial`` is the quarter degree of an interlaced partial scan (section 4).
-    """
-    header = len(words) | config[_UNIT] << 14
-    if partial is not None:
-        header |= 1 << 13 | partial << 11
-    data = struct.pack("<H", header) + words.astype("<u2").tobytes()
-    if config[_AVAILABILITY] & INDICES:
-        data += bytes(index & 0xFF for index in indices)
-    return reply(VALUES_REPLY, data, status, address)
+    errors: tuple[tuple[int, int], ...] = ()
+    """(type, number): type 1 info to 4 fatal, 80h more once it is past (section 3.4)."""
+    pollution: tuple[int, ...] = _POLLUTION
+    """Eight channels; and four of reference."""
+    reference_pollution: tuple[int, ...] = _REFERENCE_POLLUTION
+    polluted: bool = False
+    implausible: bool = False
+    restart: bool = False
+
+    @property
+    def worst(self) -> int:
+        """The gravest error that is not past: 0 none, 4 fatal."""
+        return max((kind for kind, _ in self.errors if kind < _PAST), default=0)
+
+    @property
+    def status(self) -> int:
+        """The status byte of every reply (section 1)."""
+        return (
+            STATUS_OK
+            | self.worst
+            | self.restart * _RESTART
+            | self.implausible * _IMPLAUSIBLE
+            | self.polluted * _POLLUTED
+        )
+
+    @property
+    def after_reset(self) -> Health:
+        """The same with every error past."""
+        return replace(self, errors=tuple((kind | _PAST, number) for kind, number in self.errors))
+
+
+def _put(out: bytearray, offset: int, layout: str, *numbers: int) -> None:
+    struct.pack_into("<" + layout, out, offset, *numbers)
+
+
+def _own_fields() -> bytes:
+    out = bytearray(153)  # from the command byte on, so that offsets are the sheet's
+    out[10:18] = b"00291291"
+    _put(out, 43, "8H4H", *_POLLUTION, *_REFERENCE_POLLUTION)  # as calibrated
+    _put(out, 71, "H", 62)
+    _put(out, 75, "3H", 59, 54, 51)
+    _put(out, 83, "9H", 100, 90, 120, 105, 240, 70, 160, 71, 162)
+    _put(out, 103, "HH", 0x0A64, 0x0A62)
+    _put(out, 123, "B", 1)
+    out[124:131] = b"V01.20 "
+    _put(out, 131, "4I3H", 1, 1, 1, 1, 5000, 5100, 950)
+    return bytes(out[1:])
+
+
+OWN_FIELDS = _own_fields()
+"""What is one device's own in the 152 data bytes of B1: serial number, optics, calibration, boot PROM."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,36 +218,24 @@ class StatusFields:
     motor_us: int
     """Microseconds for 1/90 of a revolution."""
     version: str = "V02.10 "
-    serial: str = "00291291"
     address: int = 0
+    field_set: int = 0
+    health: Health = field(default_factory=Health)
 
 
-_POLLUTION = (402, 282, 479, 667, 375, 273, 449, 326)
-_REFERENCE_POLLUTION = (432, 338, 421, 402)
+def status_data(f: StatusFields, own: bytes = OWN_FIELDS) -> bytes:
+    """Return the 152 data bytes of B1, without the status byte that ends them (section 3.1).
 
-
-def status_data(f: StatusFields) -> bytes:
-    """Return the 152 data bytes of B1, without the status byte that ends them (section 3.1)."""
-    out = bytearray(153)  # from the command byte on, so that offsets are the sheet's
-
-    def put(offset: int, layout: str, *numbers: int) -> None:
-        struct.pack_into("<" + layout, out, offset, *numbers)
-
+    ``own`` is the same of the individual device; what follows from the state is written over it.
+    """
+    out = bytearray(b"\xb1" + own)
     out[1:8] = f.version.encode("ascii").ljust(7)[:7]
-    put(8, "BB", f.mode, 0)
-    out[10:18] = f.serial.encode("ascii").ljust(8)[:8]
-    put(19, "8H4H8H4H", *(2 * (_POLLUTION + _REFERENCE_POLLUTION)))
-    put(67, "H", f.motor_us)
-    put(71, "H", 62)
-    put(75, "3H", 59, 54, 51)
-    put(83, "HHHHH", 100, 90, 120, 105, 240)
-    put(93, "4H", 70, 160, 71, 162)
-    put(102, "B", f.config[_MEASURING_MODE])
-    put(103, "HH", 0x0A64, 0x0A62)
-    put(107, "HH", f.variant.angle_deg, f.variant.resolution_cdeg)
-    put(111, "BH", f.config[10], f.config[11])
-    put(116, "H", _BAUD_WORD[f.baud])
-    put(118, "6B", f.config[9], f.permanent_baud, f.address, 0, f.config[_UNIT], 1)
-    out[124:131] = b"V01.20 "
-    put(131, "4I3H", 1, 1, 1, 1, 5000, 5100, 950)
+    _put(out, 8, "BB", f.mode, f.health.worst)
+    _put(out, 19, "8H4H", *f.health.pollution, *f.health.reference_pollution)
+    _put(out, 67, "H", f.motor_us)
+    _put(out, 102, "B", f.config[MEASURING_MODE])
+    _put(out, 107, "HH", f.variant.angle_deg, f.variant.resolution_cdeg)
+    _put(out, 111, "BH", f.config[RESTART_MODE], f.config[RESTART_TIME])
+    _put(out, 116, "H", _BAUD_WORD[f.baud])
+    _put(out, 118, "5B", f.config[EVALUATIONS], f.permanent_baud, f.address, f.field_set, f.config[UNIT])
     return bytes(out[1:])
