@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from polecal.calib import moments, solve
 from polecal.calib.acceptance import Criteria, Verdict, judge
+from polecal.calib.blas import one_thread
 from polecal.calib.coverage import Need, Slice, coverage, slice_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
@@ -159,6 +160,7 @@ def calibrate(
     return estimate(passes, setup, everywhere=True)
 
 
+@one_thread
 def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) -> Result:
     """Find the mount from passes; ``everywhere`` looks for lower minima far from the hand measurement, too.
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from polecal.calib.blas import one_thread
 from polecal.calib.geometry import Array, rotation, skew
 from polecal.calib.observations import Returns
 
@@ -28,7 +29,7 @@ RANGE = slice(10, 16)
 TIME = slice(16, 26)
 """Where in h⁺ are h, the part that a range offset scales, and the part that a time offset scales."""
 WIDTH = 26
-_BLOCK = 8192  # returns at once: 5 MB of features, which stay in the cache's reach
+_BLOCK = 2048  # returns at once: 1.3 MB of features, which stay in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,7 @@ def zero() -> Moments:
     return Moments(0, np.zeros(3 * WIDTH), np.zeros((3 * WIDTH, 3 * WIDTH)))
 
 
+@one_thread
 def of(returns: Returns) -> Moments:
     """Sum up returns, whatever their kind."""
     total = zero()
