@@ -25,6 +25,7 @@ LEVELS_MODE = 0x01  # measuring mode 01: 13 bits of range, 3 of reflectivity (sh
 
 _REVOLUTION_NS = round(REVOLUTION_S * 1e9)
 _MIRROR_DRIFT = 5e-3  # a motor, not a crystal: 75 Hz is 13.33 ms, the sheet's 148 µs word says 13.32 ms
+_SILENCE_NS = 2_000_000_000  # after which it may have been switched off, and count from anywhere
 _MOST_WAITING = 256  # scans that wait for their poses: 14 s at 18.8 Hz
 _SLOWEST_MPS, _SLOWEST_RADPS = 0.05, 0.02  # a vehicle that stands adds weight and no information
 _GATE_M = (0.5, 2.5)
@@ -122,6 +123,8 @@ class LaserChannel:
         stamp_ns = round(frame.t_first_ns - frame.lead_bytes * self._byte_ns)
         if scan.scan_index is None:
             return stamp_ns
+        if self._revolutions is not None and stamp_ns - self._revolutions[1] > _SILENCE_NS:
+            self._clock, self._revolutions = Clock(max_drift=_MIRROR_DRIFT), None
         count, at_ns = self._revolutions or (scan.scan_index, stamp_ns)
         guess = count + (stamp_ns - at_ns) / _REVOLUTION_NS  # the counter is mod 256: 3.4 s
         count = scan.scan_index + 256 * round((guess - scan.scan_index) / 256)
@@ -131,7 +134,7 @@ class LaserChannel:
 
     def fuse(self) -> list[StoredPass]:
         """Place the scans whose poses are all there; give the passes that have ended."""
-        while self._waiting:
+        while self._waiting and self._gps_clock.locked:  # a clock that starts anew is seconds off at first
             stx_gps_ns = self._gps_clock.to_device(self._waiting[0].stx_ns)
             if stx_gps_ns - int(self._age_ns.min()) > self._trajectory.last_ns:
                 break
