@@ -68,6 +68,7 @@ class _LaserRun:
             passes for place, passes in self._passes.items() if self.channel.places.could_be_pole(place)
         ]
         if not could_be:
+            self.result = None  # what was thin from one side has turned out to be a plate
             return
         passes = max(could_be, key=self._progress)
         try:
