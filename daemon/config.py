@@ -141,9 +141,14 @@ class Laser(_Part):
 
     @field_validator("reflectivity")
     @classmethod
-    def _ninety_is_an_s14(cls, reflectivity: str, info: ValidationInfo) -> str:
-        if info.data.get("fov_deg") == 90 and reflectivity != "s14":
-            raise _fault(f"only an S14 scans 90°: needs s14, not {reflectivity}, or another fov_deg")
+    def _some_laser_can_do_it(cls, reflectivity: str, info: ValidationInfo) -> str:
+        from polecal.drivers.sick_lms import refusal  # noqa: PLC0415 - numpy; the operator's command has none
+
+        fov_deg, resolution_deg, baud = map(info.data.get, ("fov_deg", "resolution_deg", "baud"))
+        if fov_deg and resolution_deg and baud:
+            reason = refusal(fov_deg, resolution_deg, reflectivity, baud)
+            if reason:
+                raise _fault(reason)
         return reflectivity
 
 

@@ -19,10 +19,11 @@ from polecal.drivers.clock import Clock
 from polecal.drivers.errors import DeviceProtocolError
 from polecal.drivers.port import BITS_PER_BYTE
 from polecal.drivers.sick_lms import REVOLUTION_S, Frame, Framer, Scan, beam_ages_s, bearings_rad, decode
-from polecal.drivers.sick_lms.scans import VALUES
+from polecal.drivers.sick_lms.scans import ENERGY, S14, VALUES
 
 LEVELS_MODE = 0x01  # measuring mode 01: 13 bits of range, 3 of reflectivity (sheet, 3.3)
 
+_SCANS = frozenset((VALUES, ENERGY, S14))  # by levels, or what it fell back to; by energy; of an S14
 _REVOLUTION_NS = round(REVOLUTION_S * 1e9)
 _MIRROR_DRIFT = 5e-3  # a motor, not a crystal: 75 Hz is 13.33 ms, the sheet's 148 µs word says 13.32 ms
 _SILENCE_NS = 2_000_000_000  # after which it may have been switched off, and count from anywhere
@@ -85,7 +86,7 @@ class LaserChannel:
     def feed(self, t_ns: int, data: bytes) -> None:
         """Take a chunk that was read at host time ``t_ns``."""
         for frame in self.framer.feed(data, t_ns):
-            if frame.command != VALUES:
+            if frame.command not in _SCANS:
                 continue
             try:
                 scan = Scan.parse(frame)

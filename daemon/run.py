@@ -146,6 +146,7 @@ class Run:
             "identity": device.identity,
             **self._pipeline.device(device.name),
             "reconnects": device.reconnects,
+            **device.about(),
             **({"problem": str(problem), "hint": problem.hint} if problem is not None else {}),
         }
 

@@ -104,6 +104,10 @@ class Device(ABC):
             self._log.warning("device trouble", problem=str(error), hint=error.hint)
         self.state, self.problem = "lost", error
 
+    def about(self) -> dict[str, object]:
+        """Give what the device last said of itself, beyond its stream, as JSON-able values."""
+        return {}
+
     @abstractmethod
     def _set_up(self, port: Port) -> None:
         """Find the device, configure it and start its stream. Raises Stopped, DeviceError."""

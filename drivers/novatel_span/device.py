@@ -76,6 +76,10 @@ class NovatelSpan(Device):
         """What the receiver answered to each command of the last set-up: OK, ERROR:..., or nothing."""
         self._talk: _Talk | None = None
 
+    def about(self) -> dict[str, object]:
+        """Give the point of the vehicle that its poses speak of."""
+        return {"reference_point": self.reference_point}
+
     def _set_up(self, port: Port) -> None:
         period_s = self._period_s()
         self.pose, self.results, self._talk = None, {}, None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from polecal.drivers.device import Device
@@ -135,6 +135,14 @@ class SickLms(Device):
         self._talk: Conversation | None = None
         self._refused_data: set[bytes] = set()  # configurations that were written and did not hold
         self._health_due_ns = 0
+
+    def about(self) -> dict[str, object]:
+        """Give its health, how its reflectivity comes, and how often its EEPROM was written."""
+        return {
+            "health": asdict(self.health),
+            "reflectivity": self.reflectivity,
+            "eeprom_writes": self.eeprom_writes,
+        }
 
     def _set_up(self, port: Port) -> None:
         self._talk = None
