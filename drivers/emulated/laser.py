@@ -287,10 +287,10 @@ class EmulatedLaser(EmulatedDevice):
             turns = self.variant.revolutions
             ends = range(end - (output.scans - 1) * turns, end + 1, turns)
             beams = mean([self._mirror.scan(each, self.variant) for each in ends])
-        self._telegrams += 1
         data = output.pack(beams, config, partial)
         if config[lms.AVAILABILITY] & lms.INDICES:
-            data += bytes([end & 0xFF, self._telegrams & 0xFF])
+            data += bytes([(end - 1) & 0xFF, self._telegrams & 0xFF])
+        self._telegrams += 1
         return self._reply(output.code, data)
 
     def _send_paced(self, turn: int, data: bytes) -> None:

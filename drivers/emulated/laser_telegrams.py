@@ -84,15 +84,8 @@ DEFAULT_CONFIG = bytes.fromhex(
 STREAM_CONFIG = DEFAULT_CONFIG[:4] + b"\x02\x01" + DEFAULT_CONFIG[6:]
 """Real-time indices on, measuring mode 01: reflectivity in bits 13 to 15."""
 
-SENSITIVITY, AVAILABILITY, MEASURING_MODE, UNIT, EVALUATIONS, RESTART_MODE, RESTART_TIME = (
-    3,
-    4,
-    5,
-    6,
-    9,
-    10,
-    11,
-)
+SENSITIVITY, AVAILABILITY, MEASURING_MODE, UNIT = 3, 4, 5, 6
+EVALUATIONS, RESTART_MODE, RESTART_TIME = 9, 10, 11
 """Offsets in the configuration (section 3.2)."""
 INDICES = 0x02  # availability bit 1
 

@@ -103,13 +103,14 @@ def value_words(beams: Beams, config: bytes) -> Words:
 def energy_words(beams: Beams, config: bytes) -> Words:
     """Return the received energy of each beam (N,), 0 without an echo."""
     least = 0 if config[MEASURING_MODE] == NORMALISED else _ENERGY_MIN
-    energy = least + beams.level * (_ENERGY_MAX - least) // _TOP_LEVEL
+    energy = np.rint(least + beams.level * (_ENERGY_MAX - least) / _TOP_LEVEL)
     return np.where(beams.fault == IN_RANGE, energy, 0).astype(np.uint16)
 
 
 def reflectivity_bytes(beams: Beams) -> NDArray[np.uint8]:
     """Return the S14's reflectivity of each beam (N,), 0 to 255."""
-    return np.where(beams.fault == IN_RANGE, beams.level * _BYTE_MAX // _TOP_LEVEL, 0).astype(np.uint8)
+    bright = np.rint(beams.level * _BYTE_MAX / _TOP_LEVEL)
+    return np.where(beams.fault == IN_RANGE, bright, 0).astype(np.uint8)
 
 
 def mean(scans: Sequence[Beams]) -> Beams:

@@ -370,7 +370,7 @@ def test_an_info_may_be_pending(parked, host, t0_ns, known):
 
 
 def test_requests_may_be_overlooked(parked, host, t0_ns, known):
-    client = quirky(parked, host, t0_ns, lost_ack=0.5)
+    client = quirky(parked, host, t0_ns, overlooked=0.5)
     answered = [bool(client.ask(known("3Ah"))) for _ in range(40)]
     assert 8 < sum(answered) < 32
 
@@ -397,9 +397,42 @@ def test_a_configuration_may_be_refused(parked, host, t0_ns, known):
     assert client.device.eeprom_writes == 0
 
 
+def test_an_accepted_configuration_may_be_answered_as_if_it_were_not(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, accept_as_zero=True)
+    client.ask(known(INSTALL))
+    request = known(CONFIG_01)
+    assert client.ask(request) == ACK + lms.reply(0xF7, b"\x00" + request[5:-2])
+    assert client.device.config == request[5:-2]
+
+
+def test_an_ack_may_be_lost(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, lost_ack=1.0)
+    assert client.ask(known("32h")) == known("B2h no errors")
+
+
+def test_the_answer_to_a_change_of_rate_may_be_lost(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, lost_rate_reply=1.0)
+    assert client.ask(known("20h 48")) == ACK
+    client.baud = 500000
+    assert client.ask(known("20h 25")) == ACK + known("A0h mode switch ok (status 10h)")
+
+
+def test_firmware_may_have_no_energy(parked, host, t0_ns, known):
+    client = quirky(parked, host, t0_ns, refuse_energy=True)
+    client.ask(known(INSTALL))
+    assert client.ask(known("77h LMS291 config, mode 0E"))[5:7] == b"\xf7\x00"
+    assert client.ask(known("77h 32-byte"))[5:7] == b"\xf7\x00"
+    assert client.ask(known("20h 2B"))[5:7] == b"\xa0\x01"
+    assert client.ask(lms.telegram(0, bytes.fromhex("75 0100 0100 0300")))[5:6] == b"\x92"
+
+
 def test_old_firmware_has_32_bytes_of_configuration(parked, host, t0_ns, known):
     client = quirky(parked, host, t0_ns, short_config=True)
     assert client.ask(known("74h")) == ACK + lms.reply(0xF4, lms.DEFAULT_CONFIG[:32])
+    client.ask(known(INSTALL))
+    old = known("77h 32-byte")[5:-2]
+    assert client.ask(known("77h 32-byte")) == ACK + lms.reply(0xF7, b"\x01" + old)
+    assert client.ask(known("7Bh")) == ACK + lms.reply(0xFB, bytes(4))
 
 
 def test_a_beam_without_an_echo_is_an_overflow_code(parked, host, t0_ns):
