@@ -9,8 +9,11 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from polecal.calib import CalibrationError, Pass, Result, estimate
+import numpy as np
+
+from polecal.calib import CalibrationError, Mount, Pass, Result, estimate
 from polecal.calib.coverage import headings
+from polecal.calib.geometry import wrap
 from polecal.daemon import results
 from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.fusion import LaserChannel
@@ -75,7 +78,15 @@ class _LaserRun:
             self.result = estimate(passes, self.setup, everywhere=everywhere)
         except CalibrationError:
             return
-        self.channel.mount = self.result.mount
+        # One pass over level ground may put the laser anywhere; what is placed by that is lost.
+        self.channel.mount = self.result.mount if self._is_near(self.result.mount) else self.setup.measured
+
+    def _is_near(self, mount: Mount) -> bool:
+        """Say whether a mount is near enough to the hand measurement to look for the pole with it."""
+        shift = mount.vector - self.setup.measured.vector
+        shift[3:] = wrap(shift[3:])
+        most = self.setup.criteria.max_shift_sigmas * self.setup.measured_sigma.vector
+        return bool((np.abs(shift) <= most).all())
 
     def _progress(self, passes: Iterable[Pass]) -> int:
         """Give how many pole returns count, of those that each slice needs."""
