@@ -10,8 +10,9 @@ from typing import Any
 from polecal.daemon import config as configuration
 from polecal.daemon import recorder
 from polecal.daemon.pipeline import Pipeline
+from polecal.daemon.recorder import RecorderError
 from polecal.daemon.routine import State
-from polecal.daemon.sessions import Session
+from polecal.daemon.sessions import Session, SessionError
 
 BEGIN, FINISH = "begin", "finish"
 """Events that are inputs of the pipeline, and so part of a replay."""
@@ -46,10 +47,18 @@ def replay(
     """
     source = recorder.read(capture)
     recorded = source.metadata
+    lacking = ", ".join(key for key in ("session", "created", "config") if key not in recorded)
+    if lacking:
+        raise RecorderError(f"{capture}: does not say its {lacking}", "name a session's capture.mcap")
     settings = configuration.load(config) if config else configuration.loads(recorded["config"], str(capture))
     out = out or capture.parent / "replay"
     session = Session(out, recorded["created"])
-    (out / "passes").mkdir(parents=True, exist_ok=True)
+    try:
+        (out / "passes").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SessionError(
+            f"{out}: cannot be made: {error.strerror}", "name another folder to write to"
+        ) from error
     pipeline = Pipeline(
         settings, session=recorded["session"], created=recorded["created"], on_pass=session.write_pass
     )
