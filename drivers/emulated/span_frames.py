@@ -1,98 +1,56 @@
-"""A SPAN receiver's binary logs, as the receiver builds them: a solution in, framed bytes out.
+"""A SPAN receiver's framing, from its side: header and fields to bytes, and a host's bytes to commands.
 
-Layouts, ids and definition CRCs are those of the protocol sheet (sections 1 to 3).
+Sheet, section 1. The logs that go into the frames are in `span_logs`.
 """
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
-from enum import IntEnum
+
+from polecal.drivers.emulated.span_enums import TimeStatus
 
 WEEK_MS = 604_800_000
-GPS_EPOCH = datetime(1980, 1, 6)
-UTC_OFFSET_S = -18.0
-FINESTEERING = 180
-COM1 = 0x20
 LONG_HEADER = 28
 SHORT_HEADER = 12
 RESPONSE_BIT = 0x80
-WGS84 = 61
+VIRTUAL_PORTS = 32  # of each port, its own number being the first
+PORT_IDS = {
+    "COM1": 0x20, "COM2": 0x40, "COM3": 0x60, "SPECIAL": 0xA0, "THISPORT": 0xC0, "FILE": 0xE0,
+    "USB1": 0x5A0, "USB2": 0x6A0, "USB3": 0x7A0, "AUX": 0x8A0, "COM4": 0xBA0, "ETH1": 0xCA0, "IMU": 0xDA0,
+    "ICOM1": 0xFA0, "ICOM2": 0x10A0, "ICOM3": 0x11A0, "NCOM1": 0x12A0, "COM5": 0x17A0, "COM6": 0x18A0,
+}  # fmt: skip
+"""Section 3.6."""
 
 _LONG = struct.Struct("<3sBHBBHHBBHIIHH")
 _SHORT = struct.Struct("<3sBHHI")
-_SOFTWARE_BUILD = 16248
-_IDLE = 130  # half percents
-
-
-class InsStatus(IntEnum):
-    """Section 3.1, those that the emulated receiver goes through."""
-
-    ALIGNING = 1
-    SOLUTION_GOOD = 3
-    ALIGNMENT_COMPLETE = 7
-
-
-class PosType(IntEnum):
-    """Section 3.3, likewise."""
-
-    NONE = 0
-    NARROW_INT = 50
-    INS_RTKFIXED = 56
 
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """What a header says: GPS week and ms, the receiver's status word, the port."""
+    """What a header says of the receiver at a moment (section 1.2)."""
 
     week: int
     ms: int
     status: int = 0x02000000
-    port: int = COM1
+    """The receiver's status word."""
+    port: str = "COM1"
+    virtual: int = 0
+    """The virtual port's number, 0 for the port itself."""
     source: int = 0
     """Measurement source bits of the message type."""
-
-
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """What the receiver knows at an epoch; degrees, m, m/s.
-
-    ``position`` is latitude, longitude and height above the ellipsoid of the IMU; ``antenna`` likewise of
-    the antenna. ``sigma`` has latitude, longitude, height in m; north, east, up in m/s; roll, pitch,
-    azimuth in degrees.
-    """
-
-    stamp: Stamp
-    position: tuple[float, float, float]
-    velocity: tuple[float, float, float]
-    """North, east, up."""
-    attitude: tuple[float, float, float]
-    """Roll, pitch, azimuth."""
-    antenna: tuple[float, float, float]
-    ins_status: InsStatus = InsStatus.SOLUTION_GOOD
-    pos_type: PosType = PosType.INS_RTKFIXED
-    undulation_m: float = 22.5
-    sigma: tuple[float, ...] = (0.012, 0.012, 0.015, 0.01, 0.01, 0.01, 0.015, 0.015, 0.04)
+    time_status: TimeStatus = TimeStatus.FINESTEERING
+    idle: int = 130
+    """Half percents."""
+    build: int = 16248
+    sequence: int = 0
 
     @property
-    def seconds(self) -> float:
-        """Return the seconds of the week."""
-        return self.stamp.ms / 1000
-
-
-_PLACEHOLDER = (-90.0, 0.0, -6356752.3142)  # an unaligned OEM6's pose: the south pole's depth
-
-
-def unaligned(stamp: Stamp, antenna: tuple[float, float, float]) -> Solution:
-    """Return what a receiver says that has not begun to know its attitude (section 10, item 2)."""
-    zero = (0.0, 0.0, 0.0)
-    return Solution(
-        stamp, _PLACEHOLDER, zero, zero, antenna, InsStatus.ALIGNING, PosType.NONE, sigma=(0.0,) * 9
-    )
+    def port_name(self) -> str:
+        """Return the port as ASCII headers spell it."""
+        return f"{self.port}_{self.virtual}" if self.virtual else self.port
 
 
 def crc32(data: bytes) -> int:
@@ -104,10 +62,10 @@ def long_frame(
     message_id: int, body: bytes, stamp: Stamp, *, definition: int = 0, response: bool = False
 ) -> bytes:
     """Frame a body with the long header (section 1.2)."""
-    message_type = stamp.source | (RESPONSE_BIT if response else 0)
     frame = _LONG.pack(
-        b"\xaa\x44\x12", LONG_HEADER, message_id, message_type, stamp.port, len(body), 0, _IDLE, FINESTEERING,
-        stamp.week, stamp.ms, stamp.status, definition, _SOFTWARE_BUILD,
+        b"\xaa\x44\x12", LONG_HEADER, message_id, stamp.source | (RESPONSE_BIT if response else 0),
+        (PORT_IDS[stamp.port] & 0xFF) + stamp.virtual, len(body), stamp.sequence, stamp.idle,
+        stamp.time_status, stamp.week, stamp.ms, stamp.status, definition, stamp.build,
     )  # fmt: skip
     return frame + body + struct.pack("<I", crc32(frame + body))
 
@@ -118,139 +76,33 @@ def short_frame(message_id: int, body: bytes, stamp: Stamp) -> bytes:
     return frame + struct.pack("<I", crc32(frame))
 
 
-@dataclass(frozen=True, slots=True)
-class Log:
-    """A log's number, how it is framed, and its body."""
-
-    message_id: int
-    body: Callable[[Solution], bytes]
-    definition: int = 0
-    short: bool = False
-    fastest_ms: int = 10
-    natural_ms: int = 1000
-    """How often there is something new, for ONNEW; 0 for what never changes."""
-
-    def frame(self, solution: Solution) -> bytes:
-        """Return the whole frame."""
-        if self.short:
-            return short_frame(self.message_id, self.body(solution), solution.stamp)
-        return long_frame(self.message_id, self.body(solution), solution.stamp, definition=self.definition)
+def _said(stamp: Stamp, definition: int, short: bool) -> list[str]:
+    """Return what follows the name in an ASCII header (section 1.5)."""
+    seconds = f"{stamp.ms / 1000:.3f}"
+    if short:
+        return [str(stamp.week), seconds]
+    return [
+        stamp.port_name, str(stamp.sequence), f"{stamp.idle / 2:.1f}", stamp.time_status.name,
+        str(stamp.week), seconds, f"{stamp.status:08x}", f"{definition:04x}", str(stamp.build),
+    ]  # fmt: skip
 
 
-def _inspva(s: Solution) -> bytes:
-    return struct.pack(
-        "<Id9dI", s.stamp.week, s.seconds, *s.position, *s.velocity, *s.attitude, s.ins_status
-    )  # ellipsoidal height
+def ascii_line(
+    name: str, fields: Sequence[str], stamp: Stamp, *, definition: int = 0, short: bool = False
+) -> bytes:
+    """Return an ASCII log; the name comes with its A (or R, of a response)."""
+    source = f"_{stamp.source}" if stamp.source and not short else ""
+    text = ",".join([name + source, *_said(stamp, definition, short)]) + ";" + ",".join(fields)
+    return f"{'%' if short else '#'}{text}*{crc32(text.encode()):08x}\r\n".encode()
 
 
-def _inspvax(s: Solution) -> bytes:
-    lat, lon, height = s.position
-    extended = 0x4F if s.ins_status == InsStatus.SOLUTION_GOOD else 0  # converged, with updates
-    return struct.pack(
-        "<II3df6d9fIH", s.ins_status, s.pos_type, lat, lon, _above_sea(height, s), s.undulation_m,
-        *s.velocity, *s.attitude, *s.sigma, extended, 0,
-    )  # fmt: skip
-
-
-def _above_sea(height_m: float, s: Solution) -> float:
-    undulation: float = struct.unpack("<f", struct.pack("<f", s.undulation_m))[0]  # as the log can say it
-    return height_m - undulation
-
-
-def _insatt(s: Solution) -> bytes:
-    return struct.pack("<Id3dI", s.stamp.week, s.seconds, *s.attitude, s.ins_status)
-
-
-def _inspos(s: Solution) -> bytes:
-    return struct.pack("<Id3dI", s.stamp.week, s.seconds, *s.position, s.ins_status)
-
-
-def _insvel(s: Solution) -> bytes:
-    return struct.pack("<Id3dI", s.stamp.week, s.seconds, *s.velocity, s.ins_status)
-
-
-def _inscov(s: Solution) -> bytes:
-    def diagonal(a: float, b: float, c: float) -> list[float]:
-        return [a * a, 0, 0, 0, b * b, 0, 0, 0, c * c]
-
-    lat, lon, height, north, east, up, roll, pitch, azimuth = s.sigma
-    return struct.pack(
-        "<Id27d", s.stamp.week, s.seconds, *diagonal(lat, lon, height), *diagonal(pitch, roll, azimuth),
-        *diagonal(north, east, up),
-    )  # fmt: skip
-
-
-def _insstdev(s: Solution) -> bytes:
-    return struct.pack("<9fIHHII", *s.sigma, 0x4F, 0, 0, 0, 0)
-
-
-def _bestpos(s: Solution) -> bytes:
-    lat, lon, height = s.antenna  # always the antenna's place
-    pos_type = PosType.INS_RTKFIXED if s.ins_status == InsStatus.SOLUTION_GOOD else PosType.NARROW_INT
-    return struct.pack(
-        "<II3dfI3f4s2f8B", 0, pos_type, lat, lon, _above_sea(height, s), s.undulation_m, WGS84,
-        0.012, 0.012, 0.015, b"0001", 1.0, 0.0, 24, 21, 21, 19, 0, 0, 0x15, 0x33,
-    )  # fmt: skip
-
-
-def _bestvel(s: Solution) -> bytes:
-    north, east, up = s.velocity
-    track = math.degrees(math.atan2(east, north)) % 360
-    return struct.pack("<II2f3df", 0, PosType.INS_RTKFIXED, 0.0, 0.0, math.hypot(north, east), track, up, 0.0)
-
-
-def _time(s: Solution) -> bytes:
-    utc = GPS_EPOCH + timedelta(weeks=s.stamp.week, milliseconds=s.stamp.ms, seconds=UTC_OFFSET_S)
-    return struct.pack(
-        "<I3dI4B2I", 0, -1.2e-9, 9.0e-10, UTC_OFFSET_S, utc.year, utc.month, utc.day, utc.hour, utc.minute,
-        utc.second * 1000 + utc.microsecond // 1000, 1,
-    )  # fmt: skip
-
-
-def _timesync(s: Solution) -> bytes:
-    return struct.pack("<III", s.stamp.week, s.stamp.ms, FINESTEERING)
-
-
-def _rxstatus(s: Solution) -> bytes:
-    words = [(s.stamp.status, 0, 0, 0)] + [(0, 0, 0, 0)] * 4
-    return struct.pack("<II", 0, len(words)) + b"".join(struct.pack("<4I", *word) for word in words)
-
-
-def _version(_: Solution) -> bytes:
-    card = ("OEM719N", "BMGX15320028A", "OEM719N-1.00", "OM7MR0800RN0000", "OM7BR0001RB0000")
-    imu = ("EPSON_G320", "E0001234", "1.00", "1.00", "1.00")
-    items = [
-        struct.pack(
-            "<I16s16s16s16s16s12s12s", kind, *(t.encode() for t in texts), b"2020/Mar/12", b"10:31:45"
-        )
-        for kind, texts in ((1, card), (7, imu))
-    ]
-    return struct.pack("<I", len(items)) + b"".join(items)
-
-
-LOGS: dict[str, Log] = {
-    # In the order in which a receiver sends the logs of one epoch (section 10, item 7)
-    "BESTPOS": Log(42, _bestpos, 0xCDBA, fastest_ms=50, natural_ms=200),
-    "BESTGNSSPOS": Log(1429, _bestpos, fastest_ms=50, natural_ms=200),
-    "BESTVEL": Log(99, _bestvel, fastest_ms=50, natural_ms=200),
-    "TIME": Log(101, _time, 0x9924, fastest_ms=50),
-    "TIMESYNC": Log(492, _timesync, 0xBD3F, fastest_ms=50),
-    "RXSTATUS": Log(93, _rxstatus, 0x2AE1, fastest_ms=50, natural_ms=0),
-    "VERSION": Log(37, _version, 0x3681, fastest_ms=1000, natural_ms=0),
-    "INSCOV": Log(264, _inscov, 0x4B7B, fastest_ms=50),
-    "INSCOVS": Log(320, _inscov, short=True, fastest_ms=50),
-    "INSSTDEV": Log(2051, _insstdev, 0x2396, fastest_ms=50),
-    "INSSTDEVS": Log(2052, _insstdev, short=True, fastest_ms=50),
-    "INSPVAX": Log(1465, _inspvax, 0x46EB, natural_ms=10),
-    "INSPVA": Log(507, _inspva, 0x18BC, natural_ms=10),
-    "INSPVAS": Log(508, _inspva, short=True, natural_ms=10),
-    "INSATT": Log(263, _insatt, 0xC6A7, natural_ms=10),
-    "INSATTS": Log(319, _insatt, short=True, natural_ms=10),
-    "INSPOS": Log(265, _inspos, natural_ms=10),
-    "INSPOSS": Log(321, _inspos, short=True, natural_ms=10),
-    "INSVEL": Log(267, _insvel, natural_ms=10),
-    "INSVELS": Log(324, _insvel, short=True, natural_ms=10),
-}
+def abbreviated_lines(
+    name: str, rows: Sequence[tuple[int, Sequence[str]]], stamp: Stamp, *, definition: int, short: bool
+) -> bytes:
+    """Return an abbreviated ASCII log of rows (depth, fields)."""
+    lines = [" ".join([f"<{name}", *_said(stamp, definition, short)])]
+    lines += [f"<{' ' * 5 * depth}{' '.join(fields)}" for depth, fields in rows]
+    return "".join(line + "\r\n" for line in lines).encode()
 
 
 def frame_size(data: bytes | bytearray, at: int = 0) -> int | None:
@@ -266,14 +118,23 @@ def frame_size(data: bytes | bytearray, at: int = 0) -> int | None:
 
 
 def parse_frame(frame: bytes) -> tuple[int, bytes, Stamp] | None:
-    """Return a whole frame's message id, body and stamp, or None if its CRC is wrong."""
+    """Return a whole frame's message id, body and stamp (but for its port), or None if its CRC is wrong."""
     if crc32(frame[:-4]) != int.from_bytes(frame[-4:], "little"):
         return None
     if frame[2] == 0x13:
         _, _, message_id, week, ms = _SHORT.unpack_from(frame)
         return message_id, frame[SHORT_HEADER:-4], Stamp(week, ms)
     head = _LONG.unpack_from(frame)
-    return head[2], frame[head[1] : -4], Stamp(head[9], head[10], head[11], head[4], head[3] & 0x1F)
+    return head[2], frame[head[1] : -4], Stamp(head[9], head[10], head[11], source=head[3] & 0x1F)
+
+
+def parse_line(line: str) -> list[str] | None:
+    """Return the words of an ASCII command, its name (with its A) first; None if its CRC is wrong."""
+    text, _, crc = line[1:].partition("*")
+    if f"{crc32(text.encode()):08x}" != crc.strip().lower():
+        return None
+    head, _, body = text.partition(";")
+    return [head.split(",")[0], *body.split(",")]
 
 
 def frames(data: bytes) -> Iterator[tuple[int, int, bytes, Stamp]]:

@@ -9,6 +9,7 @@ from novatel_edie import oem
 from polecal.drivers.emulated import span_frames as span
 from polecal.drivers.emulated.drive import SampledTrajectory
 from polecal.drivers.emulated.receiver import EmulatedReceiver
+from polecal.drivers.emulated.span_generations import OEM4, OEM6, OEM7, OEMV
 from polecal.drivers.emulated.world import MountPose, NavError, World
 
 OK = b"\r\n<OK\r\n[COM1]"
@@ -18,6 +19,14 @@ BAD_LOG = b"\r\n<ERROR:Invalid Message. Field = 2\r\n[COM1]"
 @pytest.fixture
 def receiver(parked, t0_ns):
     return EmulatedReceiver(parked(), t0_ns=t0_ns)
+
+
+@pytest.fixture
+def connect(parked, host, t0_ns):
+    def make(world=None, baud=115200, **options):
+        return host(EmulatedReceiver(world or parked(), t0_ns=t0_ns, **options), baud)
+
+    return make
 
 
 @pytest.fixture
@@ -67,14 +76,17 @@ def test_logs_that_this_receiver_lacks_are_refused(parked, host, t0_ns):
 
 
 @pytest.mark.parametrize(
-    "line",
+    ("generation", "line"),
     [
-        b"SERIALCONFIG COM1 230400 N 8 1 N OFF\r\n",
-        b"COM COM1,230400,N,8,1,N,OFF,ON\r\n",
-        b"com com1 230400 n 8 1 n off\r\n",
+        (OEM7, b"SERIALCONFIG COM1 230400 N 8 1 N OFF\r\n"),
+        (OEM6, b"serialconfig com1 230400\r\n"),
+        (OEM6, b"COM COM1,230400,N,8,1,N,OFF,ON\r\n"),
+        (OEM4, b"com com1 230400 n 8 1 n off\r\n"),
     ],
 )
-def test_the_rate_changes_after_the_reply(client, receiver, line):
+def test_the_rate_changes_after_the_reply(connect, generation, line):
+    client = connect(generation=generation)
+    receiver = client.device
     assert client.ask(line) == OK
     assert receiver.baud == 230400
     assert OK not in client.ask(b"UNLOGALL\r\n")
@@ -83,9 +95,21 @@ def test_the_rate_changes_after_the_reply(client, receiver, line):
     assert client.ask(b"UNLOGALL\r\n") == OK
 
 
-def test_a_rate_that_does_not_exist_is_refused(client, receiver):
-    assert b"<ERROR" in client.ask(b"SERIALCONFIG COM1 123456\r\n")
-    assert receiver.baud == 115200
+@pytest.mark.parametrize(
+    ("generation", "line"),
+    [
+        (OEM7, b"SERIALCONFIG COM1 123456\r\n"),
+        (OEM7, b"SERIALCONFIG COM1 1200\r\n"),
+        (OEM7, b"SERIALCONFIG COM1 9600 E 8 1\r\n"),
+        (OEM7, b"COM COM1 230400\r\n"),
+        (OEMV, b"SERIALCONFIG COM1 230400\r\n"),
+        (OEMV, b"COM COM1 460800\r\n"),
+    ],
+)
+def test_a_rate_that_does_not_exist_is_refused(connect, generation, line):
+    client = connect(generation=generation)
+    assert b"<ERROR" in client.ask(line)
+    assert client.device.baud == 115200
 
 
 def test_half_a_line_of_noise_spoils_the_next_command_only(client):
@@ -160,12 +184,16 @@ def test_unlog_stops_one(client, edie):
     assert {type(message).__name__ for message in edie(client.listen(3.0))} == {"TIME_9924"}
 
 
-def test_it_aligns_in_steps(client, edie):
+@pytest.mark.parametrize(
+    ("generation", "before"), [(OEM4, [1]), (OEMV, [1]), (OEM6, [1]), (OEM7, [9, 11, 10, 1])]
+)
+def test_it_aligns_in_steps(connect, edie, generation, before):
+    client = connect(generation=generation)
     client.ask(b"LOG INSPVASB ONTIME 0.1\r\n", 0.01)
     messages = edie(client.listen(6.0))
     statuses = [int(message.ins_solution_status) for message in messages]
-    assert [status for status, _ in itertools.groupby(statuses)] == [1, 7, 3]
-    assert {message.latitude for message in messages if message.ins_solution_status == 1} == {-90.0}
+    assert [status for status, _ in itertools.groupby(statuses)] == [*before, 7, 3]
+    assert {message.latitude for message in messages if message.ins_solution_status in before} == {-90.0}
     assert statuses.count(7) == 10
     assert statuses.index(7) == pytest.approx(29, abs=2)
 
@@ -174,7 +202,8 @@ def test_it_may_never_align(parked, host, t0_ns, edie):
     client = host(EmulatedReceiver(parked(), t0_ns=t0_ns, aligned_after_s=float("inf")), 115200)
     client.ask(b"LOG INSPVAXB ONTIME 0.2\r\n", 0.01)
     messages = edie(client.listen(60.0))
-    assert {int(message.ins_solution_status) for message in messages} == {1}
+    statuses = [int(message.ins_solution_status) for message in messages]
+    assert [status for status, _ in itertools.groupby(statuses)] == [9, 11, 10, 1]
 
 
 # --- time
