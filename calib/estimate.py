@@ -129,7 +129,7 @@ def calibrate(
     pass_error
         Let each pass have a navigation error of its own: not the paper's cost, and nearer to the truth.
     time_offset
-        Solve for a constant offset in time, too; needs the returns' velocity and rate.
+        Solve for a constant offset in time, too; needs the returns' motion.
     measured_sigma
         What the hand measurement is worth: a parameter is held where the data know it no better.
     hold
@@ -152,7 +152,7 @@ def calibrate(
         measured_sigma=measured_sigma,
         pole_radius_m=pole_radius_m,
         pass_error=pass_error,
-        time_offset=time_offset and returns.velocity_mps is not None and returns.rate_radps is not None,
+        time_offset=time_offset and returns.motion is not None,
         hold=frozenset(hold),
         criteria=criteria or Criteria(),
         need=need,

@@ -5,11 +5,12 @@ A planar scanner has z_s = 0, so a return in n is linear in what is sought (pape
     p_n = G h,  G = [x C | y C | C | p],  h = [first column of Csb, second column, r_b, 1]
 
 with C = Cbn, p the body's position, (x, y) the return in s. Two more things that shift a return are as
-linear: a range offset b moves (x, y) by b (cos θ, sin θ), and a time offset τ moves C and p by τ (Ċ, ṗ):
+linear: a range offset b moves (x, y) by b (cos θ, sin θ), and a time offset τ moves C and p along their path,
+by τ Ċ + τ²/2 C̈ and likewise p (at 5 m/s in a turn the square is 2 cm for 40 ms):
 
-    p_n = [G | cos θ C | sin θ C | Ġ] h⁺,  h⁺ = [h, b columns, τ h]
+    p_n = [G | cos θ C | sin θ C | Ġ | G̈/2] h⁺,  h⁺ = [h, b columns, τ h, τ² h]
 
-The row of n's three axes, 3 × 26 features long, is what is summed: n, Σ f, Σ f fᵀ. Any variance of the
+The row of n's three axes, 3 × 36 features long, is what is summed: n, Σ f, Σ f fᵀ. Any variance of the
 cloud, at any mount, range offset and time offset, is a quadratic form of these sums; and sums of passes
 add and subtract.
 """
@@ -27,14 +28,15 @@ from polecal.calib.observations import Returns
 BASE = slice(0, 10)
 RANGE = slice(10, 16)
 TIME = slice(16, 26)
-"""Where in h⁺ are h, the part that a range offset scales, and the part that a time offset scales."""
-WIDTH = 26
-_BLOCK = 2048  # returns at once: 1.3 MB of features, which stay in the cache
+TIME_SQUARED = slice(26, 36)
+"""Where in h⁺ are h, and the parts that a range offset, a time offset and its square scale."""
+WIDTH = 36
+_BLOCK = 2048  # returns at once: 1.8 MB of features, which stay in the cache
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Sums over returns of one kind: how many, Σ f (78,) and Σ f fᵀ (78, 78), f axis by axis of n (m)."""
+    """Sums over returns of one kind: how many, Σ f (108,) and Σ f fᵀ (108, 108), f axis by axis of n (m)."""
 
     count: int
     first: Array
@@ -47,11 +49,11 @@ class Moments:
         return Moments(self.count - other.count, self.first - other.first, self.second - other.second)
 
     def mean(self, axis: int) -> Array:
-        """Give the (26,) mean of the features of one axis of n: mean = m h⁺, m."""
+        """Give the (36,) mean of the features of one axis of n: mean = m h⁺, m."""
         return self.first[_of(axis)] / max(1, self.count)
 
     def covariance(self, axis: int) -> Array:
-        """Give the (26, 26) covariance of the features of one axis of n: var = h⁺ᵀ S h⁺, m²."""
+        """Give the (36, 36) covariance of the features of one axis of n: var = h⁺ᵀ S h⁺, m²."""
         mean = self.mean(axis)
         covariance = self.second[_of(axis), _of(axis)] / max(1, self.count) - np.outer(mean, mean)
         return (covariance + covariance.T) / 2
@@ -78,19 +80,23 @@ def of(returns: Returns) -> Moments:
 
 
 def _features(returns: Returns) -> Array:
-    """Give [G | cos θ C | sin θ C | Ġ], (N, 3, 26)."""
+    """Give [G | cos θ C | sin θ C | Ġ | G̈/2], (N, 3, 36)."""
     n = len(returns)
     c = rotation(returns.rpy_rad)
     cos = np.cos(returns.bearing_rad)[:, None, None]
     sin = np.sin(returns.bearing_rad)[:, None, None]
     r = returns.range_m[:, None, None]
     features = np.zeros((n, 3, WIDTH))
-    base, ranged, timed = (features[:, :, part] for part in (BASE, RANGE, TIME))
+    base, ranged = features[:, :, BASE], features[:, :, RANGE]
     ranged[:, :, :3], ranged[:, :, 3:] = cos * c, sin * c
     base[:, :, :6] = r * ranged
     base[:, :, 6:9], base[:, :, 9] = c, returns.position_m
-    if returns.velocity_mps is not None and returns.rate_radps is not None:
-        turn = c @ skew(returns.rate_radps)  # Ċ
-        timed[:, :, :3], timed[:, :, 3:6] = r * cos * turn, r * sin * turn
-        timed[:, :, 6:9], timed[:, :, 9] = turn, returns.velocity_mps
+    if returns.motion is not None:
+        velocity, rate, acceleration, angular_acceleration = returns.motion
+        turn = c @ skew(rate)  # Ċ
+        twist = (turn @ skew(rate) + c @ skew(angular_acceleration)) / 2  # C̈/2
+        for part, matrix, vector in ((TIME, turn, velocity), (TIME_SQUARED, twist, acceleration / 2)):
+            timed = features[:, :, part]
+            timed[:, :, :3], timed[:, :, 3:6] = r * cos * matrix, r * sin * matrix
+            timed[:, :, 6:9], timed[:, :, 9] = matrix, vector
     return features

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 from enum import IntEnum
 from typing import Self
 
@@ -67,8 +67,8 @@ class Mount:
 class Returns:
     """N returns of one sensor, each with the pose that the body had when its beam was fired.
 
-    ``velocity_mps`` and ``rate_radps``, where they are known, say how that pose was changing: with them
-    a constant time offset between laser and navigation can be told from the data.
+    The last four, where they are known, say how that pose was changing: with them a constant time offset
+    between laser and navigation can be told from the data.
     """
 
     range_m: Array
@@ -87,6 +87,10 @@ class Returns:
     """(N, 3) of the body origin in n, m/s."""
     rate_radps: Array | None = None
     """(N, 3) angular velocity of the body, in b, rad/s."""
+    acceleration_mps2: Array | None = None
+    """(N, 3) of the body origin in n, m/s²."""
+    angular_acceleration_radps2: Array | None = None
+    """(N, 3) rate of change of the angular velocity, in b, rad/s²."""
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -99,6 +103,8 @@ class Returns:
             "pass_id": (n,),
             "velocity_mps": (n, 3),
             "rate_radps": (n, 3),
+            "acceleration_mps2": (n, 3),
+            "angular_acceleration_radps2": (n, 3),
         }
         for name, shape in wanted.items():
             array = getattr(self, name)
@@ -114,16 +120,19 @@ class Returns:
         return len(self.range_m)
 
     def __getitem__(self, index: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Returns:
-        return Returns(
-            self.range_m[index],
-            self.bearing_rad[index],
-            self.position_m[index],
-            self.rpy_rad[index],
-            self.kind[index],
-            self.pass_id[index],
-            None if self.velocity_mps is None else self.velocity_mps[index],
-            None if self.rate_radps is None else self.rate_radps[index],
+        known = {part.name: getattr(self, part.name) for part in fields(self)}
+        return Returns(**{name: array[index] for name, array in known.items() if array is not None})
+
+    @property
+    def motion(self) -> tuple[Array, Array, Array, Array] | None:
+        """Velocity, rate, acceleration and angular acceleration, or None if one is not known."""
+        v, w, a, alpha = (
+            self.velocity_mps,
+            self.rate_radps,
+            self.acceleration_mps2,
+            self.angular_acceleration_radps2,
         )
+        return None if v is None or w is None or a is None or alpha is None else (v, w, a, alpha)
 
 
 def points_body(range_m: Array, bearing_rad: Array, mount: Mount) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polecal.calib.geometry import Array, roll_pitch_yaw, rotation, rotation_gradient
-from polecal.calib.moments import BASE, RANGE, TIME, WIDTH, Moments
+from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments
 from polecal.calib.observations import PARAMETERS
 
 UNKNOWNS = (*PARAMETERS, "time", "range")
@@ -43,11 +43,11 @@ class Scatter:
         self.count = np.array([one.count for one in passes], dtype=np.float64)
         self._axes = len(axes)
         spread = [one.count * sum(one.covariance(axis) for axis in axes) for one in passes]
-        self._within = fold.T @ np.stack(spread) @ fold  # (P, 26, 26)
-        self._mean = np.stack([[one.mean(axis) for axis in axes] for one in passes]) @ fold  # (P, axes, 26)
+        self._within = fold.T @ np.stack(spread) @ fold  # (P, 36, 36)
+        self._mean = np.stack([[one.mean(axis) for axis in axes] for one in passes]) @ fold  # (P, axes, 36)
 
     def form(self, used: NDArray[np.bool_], ratio: float = np.inf) -> Array:
-        """Give the quadratic form (26, 26) of the used passes' variance in m².
+        """Give the quadratic form (36, 36) of the used passes' variance in m².
 
         ``ratio`` is the variance within a pass over that of the error which all its returns share: a pass
         of n returns says no more of where its mean should be than n / (1 + n / ratio) independent ones.
@@ -150,15 +150,15 @@ def _turned(q: Array, start: Array, held: Collection[str]) -> Iterator[Array]:
 
 
 def _h(vector: Array) -> Array:
-    """Give h⁺ (26,)."""
+    """Give h⁺ (36,)."""
     time_s, range_m = vector[6:]
     columns = rotation(vector[3:6])[:, :2].T.ravel()
     h = np.concatenate([columns, vector[:3], [1.0]])
-    return np.concatenate([h, range_m * columns, time_s * h])
+    return np.concatenate([h, range_m * columns, time_s * h, time_s**2 * h])
 
 
 def _h_gradient(vector: Array) -> Array:
-    """Give dh⁺/d(x y z roll pitch yaw time range), (26, 8)."""
+    """Give dh⁺/d(x y z roll pitch yaw time range), (36, 8)."""
     time_s, range_m = vector[6:]
     gradient = np.zeros((WIDTH, len(UNKNOWNS)))
     turned = rotation_gradient(vector[3:6])[:, :, :2].transpose(0, 2, 1).reshape(3, 6).T
@@ -166,8 +166,10 @@ def _h_gradient(vector: Array) -> Array:
     gradient[:6, 3:6] = turned
     gradient[RANGE, 3:6] = range_m * turned
     gradient[TIME, :6] = time_s * gradient[BASE, :6]
+    gradient[TIME_SQUARED, :6] = time_s**2 * gradient[BASE, :6]
     h = _h(vector)
     gradient[TIME, 6] = h[BASE]
+    gradient[TIME_SQUARED, 6] = 2 * time_s * h[BASE]
     gradient[RANGE, 7] = h[:6]
     return gradient
 

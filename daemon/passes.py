@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,19 +104,13 @@ def observed(
         np.zeros(len(range_m), dtype=np.int64),
         poses.velocity_mps,
         poses.rate_radps,
+        poses.acceleration_mps2,
+        poses.angular_acceleration_radps2,
     )
 
 
 def joined(parts: list[Returns], pass_id: int) -> Returns:
     """Put returns of one pass behind one another."""
-    count = sum(map(len, parts))
-    return Returns(
-        np.concatenate([part.range_m for part in parts]),
-        np.concatenate([part.bearing_rad for part in parts]),
-        np.concatenate([part.position_m for part in parts]),
-        np.concatenate([part.rpy_rad for part in parts]),
-        np.concatenate([part.kind for part in parts]),
-        np.full(count, pass_id, dtype=np.int64),
-        np.concatenate([part.velocity_mps for part in parts if part.velocity_mps is not None]),
-        np.concatenate([part.rate_radps for part in parts if part.rate_radps is not None]),
-    )
+    known = [one.name for one in fields(Returns) if getattr(parts[0], one.name) is not None]
+    whole = Returns(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in known})
+    return replace(whole, pass_id=np.full(len(whole), pass_id, dtype=np.int64))

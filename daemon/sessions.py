@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -63,13 +63,7 @@ class Session:
                 t_ns=np.array(stored.t_ns),
                 place=np.array(stored.place),
                 gps_ns=stored.gps_ns,
-                range_m=returns.range_m,
-                bearing_rad=returns.bearing_rad,
-                position_m=returns.position_m,
-                rpy_rad=returns.rpy_rad,
-                kind=returns.kind,
-                velocity_mps=np.asarray(returns.velocity_mps),
-                rate_radps=np.asarray(returns.rate_radps),
+                **{part.name: getattr(returns, part.name) for part in fields(returns)},
                 block_slice_kind=np.array([(part, int(kind)) for part, kind in blocks]),
                 block_count=np.array([block.count for block in blocks.values()]),
                 block_first=np.stack([block.first for block in blocks.values()]),

@@ -14,12 +14,13 @@ Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 _KEPT = 2048  # nav states: 10 s at 200 Hz; twice as many rows are held, so that trimming is rare
+_ASIDE_NS = 50_000_000  # before and after, for the change of velocity: less would be the receiver's noise
 _LONGEST_GAP = 2.5  # nominal periods; between poses further apart nothing is interpolated
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """The body at N times: in n (m, rad), with velocity in n (m/s) and angular velocity in b (rad/s).
+    """The body at N times: in n (m, rad), and how that changes: of the origin in n, of the attitude in b.
 
     ``known`` is False where the time lies in a gap of the navigation, or before its start.
     """
@@ -29,6 +30,8 @@ class Poses:
     rpy_rad: Array
     velocity_mps: Array
     rate_radps: Array
+    acceleration_mps2: Array
+    angular_acceleration_radps2: Array
 
 
 class Trajectory:
@@ -68,18 +71,35 @@ class Trajectory:
 
     def at(self, gps_ns: Times) -> Poses:
         """Interpolate at (N,) GPS times that are not newer than the newest pose."""
-        times = self._gps_ns[: self._count]
-        after = np.clip(np.searchsorted(times, gps_ns), 1, max(1, self._count - 1))
         if self._count < 2:
-            empty = np.zeros((len(gps_ns), 3))
-            return Poses(np.zeros(len(gps_ns), dtype=bool), empty, empty, empty, empty)
+            nothing = np.zeros((len(gps_ns), 3))
+            return Poses(np.zeros(len(gps_ns), dtype=bool), *[nothing] * 6)
+        known, state, rate = self._interpolated(gps_ns)
+        first_ns, last_ns = self._gps_ns[0], self._gps_ns[self._count - 1]
+        early_ns, late_ns = (np.clip(gps_ns + side, first_ns, last_ns) for side in (-_ASIDE_NS, _ASIDE_NS))
+        (_, early, early_rate), (_, late, late_rate) = map(self._interpolated, (early_ns, late_ns))
+        apart_s = np.maximum(late_ns - early_ns, 1)[:, None] * 1e-9
+        turning = _body_rate(late[:, 3:], late_rate[:, 3:]) - _body_rate(early[:, 3:], early_rate[:, 3:])
+        return Poses(
+            known=known,
+            position_m=state[:, :3],
+            rpy_rad=state[:, 3:],
+            velocity_mps=rate[:, :3],
+            rate_radps=_body_rate(state[:, 3:], rate[:, 3:]),
+            acceleration_mps2=(late_rate[:, :3] - early_rate[:, :3]) / apart_s,
+            angular_acceleration_radps2=turning / apart_s,
+        )
+
+    def _interpolated(self, gps_ns: Times) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Give where it is known, the state (N, 6) and its rate of change: straight lines between poses."""
+        times = self._gps_ns[: self._count]
+        after = np.clip(np.searchsorted(times, gps_ns), 1, self._count - 1)
         before = after - 1
         span_ns = times[after] - times[before]
         part_ns = gps_ns - times[before]
         known = (span_ns <= self._gap_ns) & (part_ns >= 0) & (part_ns <= span_ns)
         rate = (self._state[after] - self._state[before]) / (span_ns * 1e-9)[:, None]
-        state = self._state[before] + rate * (part_ns * 1e-9)[:, None]
-        return Poses(known, state[:, :3], state[:, 3:], rate[:, :3], _body_rate(state[:, 3:], rate[:, 3:]))
+        return known, self._state[before] + rate * (part_ns * 1e-9)[:, None], rate
 
 
 def _body_rate(rpy_rad: Array, rpy_rate_radps: Array) -> Array:
