@@ -87,14 +87,13 @@ class LaserState:
         self.health = Health()
         self.eeprom_writes = 0
         self.running_ns = 0
-        self.power_ons = 0
+        self.power_ons = 1
         self._motor_us = motor_us
         self._own = own
         self._field_set = 0
         self._permanent_baud = None if baud == FACTORY_BAUD else baud
         self._permanent_variant: Variant | None = None
         self.power_up()
-        self.power_ons += 1
 
     def power_up(self) -> None:
         """Forget what is volatile (section 7)."""

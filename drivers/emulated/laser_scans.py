@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from polecal.drivers.emulated.drive import Floats
 from polecal.drivers.emulated.laser_telegrams import Variant
 from polecal.drivers.emulated.laser_values import IN_RANGE, Beams, Fault, Fields
 from polecal.drivers.emulated.world import World
@@ -51,7 +53,7 @@ class Mirror:
         angle_deg = np.arange(181.0 if quarter == 0 else 180.0) + quarter / _QUARTERS
         return self._look(end, np.full(len(angle_deg), end - 1), angle_deg), quarter
 
-    def _look(self, end: int, turn: np.ndarray, angle_deg: np.ndarray) -> Beams:
+    def _look(self, end: int, turn: NDArray[np.int64], angle_deg: Floats) -> Beams:
         fired_ns = self.t0_ns + np.rint((turn + angle_deg / 360) * self._revolution_ns).astype(np.int64)
         bearing_rad = np.deg2rad(90 - angle_deg)  # the laser's 0 is its right
         range_m, level = self._world.range_scan(self._world.seconds(fired_ns), bearing_rad, key=end)
