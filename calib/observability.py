@@ -39,11 +39,12 @@ class Direction:
 _FORWARD = "pass the pole heading the other way"
 _UNEVEN = "drive over uneven ground, or tilt the vehicle: planks under the wheels of one side"
 _SPEED = "pass the pole in reverse, or at another speed"
-_LEVEL = "tilt the laser, or take the measured values"
+_LEVEL = "tilt the laser so that it sees more of the ground, or take the measured values"
 _DRIVES: tuple[tuple[frozenset[str], frozenset[str], str], ...] = (
     (frozenset({"time offset"}), frozenset(_NAMES), _SPEED),
     (frozenset({"range offset"}), frozenset(_NAMES), "pass the pole on both sides, near and far"),
-    (frozenset({"z"}), frozenset({"x", "y", "z", "roll", "pitch"}), _UNEVEN),
+    (frozenset({"z"}), frozenset({"z", "roll", "pitch"}), _UNEVEN),
+    (frozenset({"z"}), frozenset({"x", "y", "z"}), f"{_FORWARD}; {_UNEVEN}"),
     (
         frozenset({"roll", "yaw"}),
         frozenset({"roll", "yaw"}),

@@ -155,10 +155,12 @@ def _motion(rig: Rig, path: _Path, s_m: Array, speed_mps: float, number: int) ->
     in_body = turned[1].transpose(0, 2, 1)
 
     def first(of: Array) -> Array:
-        return per_s / 2 * (of[2] - of[0])
+        difference: Array = per_s / 2 * (of[2] - of[0])
+        return difference
 
     def second(of: Array) -> Array:
-        return per_s**2 * (of[2] - 2 * of[1] + of[0])
+        difference: Array = per_s**2 * (of[2] - 2 * of[1] + of[0])
+        return difference
 
     return (
         np.full(len(s_m), number),
