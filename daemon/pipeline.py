@@ -14,6 +14,7 @@ import numpy as np
 from polecal.calib import CalibrationError, Mount, Pass, Result, estimate
 from polecal.calib.coverage import headings
 from polecal.calib.geometry import wrap
+from polecal.calib.uncertainty import FEWEST_PASSES
 from polecal.daemon import results
 from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.fusion import LaserChannel
@@ -284,6 +285,14 @@ class Pipeline:
                 notes.append(f"navigation says {_named(self._ins_status)}: {meaning}")
             elif not self._clock.locked:
                 notes.append("the receiver's clock is being learnt")
+        notes += [
+            f"{laser.name}: a time offset cannot be told from x yet: pass the pole in reverse, "
+            "or at another speed"
+            for laser in self._lasers.values()
+            if laser.result is not None
+            and laser.result.passes >= FEWEST_PASSES
+            and laser.result.time_offset_sigma_s is None
+        ]
         return notes
 
 

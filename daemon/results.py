@@ -60,6 +60,8 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
             "cost_m": None,
             "measured_cost_m": None,
             "improvement": None,
+            "time_offset_s": 0.0,
+            "time_offset_sigma_s": None,
             "verdict": {"accepted": False, "reasons": ["no pass of the pole yet"]},
         }
     return {
@@ -73,6 +75,8 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
         "cost_m": result.cost_m,
         "measured_cost_m": result.measured_cost_m,
         "improvement": result.improvement,
+        "time_offset_s": result.time_offset_s,
+        "time_offset_sigma_s": result.time_offset_sigma_s,
         "verdict": {"accepted": result.verdict.accepted, "reasons": list(result.verdict.reasons)},
     }
 
@@ -88,8 +92,6 @@ def calibration(name: str, setup: Setup, result: Result, session: str, created: 
         "matrix": matrix.tolist(),
         "covariance": result.covariance.tolist(),
         "returns": {kind.name.lower(): result.returns[kind] for kind in Kind},
-        "time_offset_s": result.time_offset_s,
-        "time_offset_sigma_s": result.time_offset_sigma_s,
         "session": session,
         "created": created,
     }

@@ -150,3 +150,35 @@ def test_covariance_is_in_the_order_of_the_parameters(rig):
     assert sigma[0] == pytest.approx(result.sigma.x_m)
     assert np.degrees(sigma[5]) == pytest.approx(result.sigma.yaw_deg)
     assert PARAMETERS == ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def at_speeds(returns, speeds_mps):
+    """Each pass driven straight at a speed of its own, by a laser whose stamps are 20 ms early."""
+    speed = np.asarray(speeds_mps)[returns.pass_id % len(speeds_mps)]
+    yaw = returns.rpy_rad[:, 2]
+    velocity = np.column_stack([speed * np.cos(yaw), speed * np.sin(yaw), np.zeros(len(returns))])
+    still = np.zeros((len(returns), 3))
+    return replace(
+        returns,
+        position_m=returns.position_m - 0.02 * velocity,
+        velocity_mps=velocity,
+        rate_radps=still,
+        acceleration_mps2=still,
+        angular_acceleration_radps2=still,
+    )
+
+
+def test_a_time_offset_is_held_at_zero_where_every_pass_is_driven_forward_at_one_speed(rig):
+    returns = at_speeds(rig.drive(noise_m=0.01, nav_m=0.005), [3.0])
+    result = calibrate(returns, rig.measured, pass_error=True, time_offset=True)
+    assert result.time_offset_s == 0.0
+    assert result.time_offset_sigma_s is None
+    assert result.mount.x_m == pytest.approx(rig.true.x_m + 0.06, abs=0.01), "it looks like x"
+
+
+def test_a_time_offset_is_told_from_x_by_passes_in_reverse(rig):
+    returns = at_speeds(rig.drive(noise_m=0.01, nav_m=0.005), [3.0, -2.0, 1.0])
+    result = calibrate(returns, rig.measured, pass_error=True, time_offset=True)
+    assert result.time_offset_s == pytest.approx(0.02, abs=0.002)
+    assert result.time_offset_sigma_s < 0.002
+    assert result.mount.x_m == pytest.approx(rig.true.x_m, abs=0.01)
