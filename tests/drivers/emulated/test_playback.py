@@ -101,3 +101,14 @@ def test_the_unaligned_recording_is_played_too(captures, host, t0_ns):
     recording = load_recording(captures / "span_driver_basic_fix_unaligned_10hz.bin")
     client = host(PlaybackReceiver(*recording, t0_ns=t0_ns), 115200)
     assert client.ask(b"LOG INSPVAXB ONTIME 0.1\r\n", 300.0) == OK + recording[0]
+
+
+@pytest.mark.parametrize("speed", [0.5, 10.0])
+def test_it_may_be_played_at_another_speed(driven, host, t0_ns, speed):
+    data, offsets, arrival_s = driven
+    client = host(PlaybackReceiver(*driven, t0_ns=t0_ns, start_ns=t0_ns, speed=speed), 115200)
+    client.device.force_logs(t0_ns, [("INSPVAXB", 0.05)])
+    heard = client.listen(30.0 / speed)
+    k = int(np.searchsorted(np.array(arrival_s) - arrival_s[0], 30.0, side="right"))
+    assert heard == data[: offsets[k]]
+    assert client.listen(90.0 / speed) == data[offsets[k] :]
