@@ -179,8 +179,8 @@ class EmulatedReceiver(SpanPort):
         self._advance(t_ns)
         week, ns = divmod(self._gps_ns(t_ns), WEEK_MS * 1_000_000)
         said = replace(self._solution(self.gps_ms(t_ns)), mark=(week, round(ns, -1) / 1e9))  # to 10 ns
-        named = [key for key, w in self._logs.items() if key.name in _MARKS[number] or w.trigger == "ONMARK"]
-        self._happen(t_ns, named, [said])
+        self._happen(t_ns, [key for key in self._logs if key.name in _MARKS[number]], [said])
+        self._send(t_ns, self.gps_ms(t_ns), [key for key, w in self._logs.items() if w.trigger == "ONMARK"])
 
     # --- commands
 

@@ -106,7 +106,7 @@ def test_the_unaligned_recording_is_played_too(captures, host, t0_ns):
 @pytest.mark.parametrize("speed", [0.5, 10.0])
 def test_it_may_be_played_at_another_speed(driven, host, t0_ns, speed):
     data, offsets, arrival_s = driven
-    client = host(PlaybackReceiver(*driven, t0_ns=t0_ns, start_ns=t0_ns, speed=speed), 115200)
+    client = host(PlaybackReceiver(*driven, t0_ns=t0_ns, start_ns=t0_ns + 1, speed=speed), 115200)
     client.device.force_logs(t0_ns, [("INSPVAXB", 0.05)], baud=115200)
     heard = client.listen(30.0 / speed)
     k = int(np.searchsorted(np.array(arrival_s) - arrival_s[0], 30.0, side="right"))
