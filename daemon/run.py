@@ -59,7 +59,6 @@ class Run:
             on_pass=self._store,
             on_transition=self._on_transition,
         )
-        self._recorder = Recorder(session.capture, session.metadata(config))
         self._devices: list[Device] = [
             *(
                 SickLms(
@@ -81,6 +80,7 @@ class Run:
                 rate_hz=config.navigation.rate_hz,
             ),
         ]
+        self._recorder = Recorder(session.capture, session.metadata(config))
         self._stops = [threading.Event() for _ in self._devices]
         self._leaving = False
         self._threads: list[threading.Thread] = []
@@ -96,25 +96,34 @@ class Run:
         """Where the routine is."""
         return self._pipeline.routine.state
 
+    @property
+    def problem(self) -> PolecalError | None:
+        """What made the run a fault."""
+        return self._problem
+
     def begin(self) -> None:
-        """Open every port and start. Raises DeviceError with each port that could not be opened."""
+        """Open every port and start.
+
+        Raises DeviceError with each port that could not be opened, RecorderError.
+        """
         ports: list[Port] = []
         problems: list[DeviceError] = []
-        for device, stop in zip(self._devices, self._stops, strict=True):
-            try:
-                ports.append(device.open(stop))
-            except DeviceError as error:
-                problems.append(error)
-        if problems:
-            for port in ports:
-                port.close()
-            self._recorder.close()
-            self.ended.set()
-            raise joined(problems)
-        now_ns = time.monotonic_ns()
-        self._recorder.event(now_ns, {"event": BEGIN})
-        with self._lock:
-            self._pipeline.begin(now_ns)
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.ended.set)
+            undo.callback(self._recorder.close)
+            for device, stop in zip(self._devices, self._stops, strict=True):
+                try:
+                    ports.append(device.open(stop))
+                    undo.callback(ports[-1].close)
+                except DeviceError as error:
+                    problems.append(error)
+            if problems:
+                raise joined(problems)
+            now_ns = time.monotonic_ns()
+            self._recorder.event(now_ns, {"event": BEGIN})
+            with self._lock:
+                self._pipeline.begin(now_ns)
+            undo.pop_all()
         for device, port in zip(self._devices, ports, strict=True):
             self._threads.append(threading.Thread(target=device.run, args=(port,), name=device.name))
         for thread in (*self._threads, self._engine):
@@ -145,6 +154,7 @@ class Run:
             "state": device.state,
             "identity": device.identity,
             **self._pipeline.device(device.name),
+            **({} if device.state == "streaming" else {"rate_hz": 0.0}),
             "reconnects": device.reconnects,
             **device.about(),
             **({"problem": str(problem), "hint": problem.hint} if problem is not None else {}),
