@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+import re
 import signal
 import socket
 import sys
@@ -17,12 +19,12 @@ from polecal import PolecalError, __version__
 from polecal.daemon import log, sessions
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, code_of
-from polecal.daemon.recorder import RecorderError
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.run import Run, joined, silent
 
 _START_S = 120.0  # every rate of every device tried twice, and an EEPROM written
 _LOOK_S = 0.1
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")
 
 
 class Service:
@@ -32,6 +34,8 @@ class Service:
         self._config = config
         self._run: Run | None = None
         self._starting = threading.Lock()
+        self._changing = threading.Lock()
+        self._closed = False
 
     def handle(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request. Raises Refused and other PolecalErrors."""
@@ -50,11 +54,17 @@ class Service:
                 )
 
     def close(self) -> None:
-        """End what runs, and leave the devices polite."""
+        """End what runs, leave the devices polite, and start nothing any more."""
+        with self._changing:
+            self._closed = True
         if self._run is not None:
             self._run.stop("the daemon is stopped")
 
     def _start(self, name: str | None, *, force: bool) -> dict[str, Any]:
+        if name is not None and not (isinstance(name, str) and _NAME.fullmatch(name)):
+            raise Refused(
+                f"{name!r} is no name for a session", "use 1 to 64 letters, digits, . _ or -", Code.USAGE
+            )
         if not self._starting.acquire(blocking=False):
             raise Refused(
                 "a session is being started already", "wait for it, or see `polecal-field status`", Code.BUSY
@@ -69,22 +79,34 @@ class Service:
                         Code.BUSY,
                     )
                 current.stop("another session was started")
-            run = Run(self._config, sessions.create(self._config.state_dir, self._config, name))
-            run.begin()
-            self._run = run
+            run = self._begin(name)
             self._await_streams(run)
         finally:
             self._starting.release()
         return {"class": "STARTED", "session": run.session.id, "devices": run.status()["devices"]}
 
+    def _begin(self, name: str | None) -> Run:
+        with self._changing:
+            if self._closed:
+                raise Refused("the daemon is being stopped", "start it again first", Code.BUSY)
+            run = Run(self._config, sessions.create(self._config.state_dir, self._config, name))
+            run.begin()
+            self._run = run
+        return run
+
     def _await_streams(self, run: Run) -> None:
-        """Wait until every device streams. Raises DeviceError with what each that does not is missing."""
+        """Wait until every device streams.
+
+        Raises DeviceError with what each that does not is missing, and what ended the run meanwhile.
+        """
         deadline_s = time.monotonic() + _START_S
         while time.monotonic() < deadline_s and not run.ended.wait(_LOOK_S):
             if all(device.state == "streaming" for device in run.devices):
                 return
             if all(device.state == "streaming" or device.problem is not None for device in run.devices):
                 break
+        if run.ended.is_set():
+            raise run.problem or Refused(f"session {run.session.id} was stopped while it started")
         missing = [device for device in run.devices if device.state != "streaming"]
         if not missing:
             return
@@ -149,8 +171,10 @@ def _serve(config: Config) -> int:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise RecorderError(
-                f"{folder}: cannot be made: {error.strerror}", "make it, or let systemd start polecal"
+            raise Refused(
+                f"{folder}: cannot be made: {error.strerror}",
+                "make it, or let systemd start polecal",
+                Code.NOT_PERMITTED if isinstance(error, PermissionError) else Code.CONFIG,
             ) from error
     service = Service(config)
     with ControlServer(config.socket, service):
@@ -166,7 +190,7 @@ def _notify(state: str) -> None:
     """Tell systemd, where it listens (sd_notify(3))."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
             notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
