@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -276,25 +279,76 @@ class Bench:
         return self.laser.mode == lms.Mode.REQUEST and self.laser.baud == 9600 and not self.receiver._logs
 
 
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    """The demonstration's devices, but aligned from the start and with nothing to write to an EEPROM."""
+@contextmanager
+def _bench(folder: Path) -> Iterator[Bench]:
+    """Devices that are aligned from the start, with nothing to write to an EEPROM, in a world of one pass.
+
+    The vehicle drives straight on and passes the pole 6 s after the laser's first scan.
+    """
     now_ns = time.monotonic_ns()
-    world = demo_world(1)
+    t = np.array([0.0, 1e3])
+    way = np.column_stack([3.0 * t, np.zeros(2), np.full(2, -0.1)])
+    straight = SampledTrajectory(t, way, np.zeros((2, 3)), np.tile([3.0, 0, 0], (2, 1)))
+    world = World(straight, mount=HAND_MEASURED, pole_ne_m=(18.0, 1.0))
     laser = EmulatedLaser(world, t0_ns=now_ns - 2 * 10**9, eeprom=lms.STREAM_CONFIG)
     receiver = EmulatedReceiver(world, t0_ns=now_ns, baud=230400, aligned_after_s=-2.0)
     content = {
-        "state_dir": str(tmp_path / "state"),
-        "runtime_dir": str(tmp_path / "run"),
-        "lasers": [{"name": "front", "port": str(tmp_path / "lms"), "mount": MEASURED}],
-        "navigation": {"port": str(tmp_path / "span")},
+        "state_dir": str(folder / "state"),
+        "runtime_dir": str(folder / "run"),
+        "lasers": [{"name": "front", "port": str(folder / "lms"), "mount": MEASURED}],
+        "navigation": {"port": str(folder / "span")},
         "pole": POLE,
     }
-    served = Served({tmp_path / "lms": laser, tmp_path / "span": receiver})
+    served = Served({folder / "lms": laser, folder / "span": receiver})
     try:
-        yield Bench(tmp_path, laser, receiver, served, content)
+        yield Bench(folder, laser, receiver, served, content)
     finally:
         served.close()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    """Devices on pseudo-terminals, for one test."""
+    with _bench(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def shared_bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Devices on pseudo-terminals, for a module."""
+    with _bench(tmp_path_factory.mktemp("bench")) as made:
+        yield made
+
+
+@contextmanager
+def _running(bench: Bench) -> Iterator[subprocess.Popen[bytes]]:
+    address = bench.folder / "notify"
+    address.unlink(missing_ok=True)
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify,
+        (bench.folder / "polecald.log").open("ab") as log,
+    ):
+        notify.bind(str(address))
+        notify.settimeout(20.0)
+        command = [sys.executable, "-W", "error", "-m", "polecal.daemon.service", "--config"]
+        environment = os.environ | {"NOTIFY_SOCKET": str(address)}
+        with subprocess.Popen([*command, str(bench.config_file)], stderr=log, env=environment) as daemon:
+            try:
+                assert notify.recv(64) == b"READY=1"
+                yield daemon
+            finally:
+                daemon.terminate()
+                try:
+                    daemon.wait(20.0)
+                except subprocess.TimeoutExpired:
+                    daemon.kill()
+                    raise
+
+
+@pytest.fixture(scope="session")
+def running() -> Callable[[Bench], Any]:
+    """A daemon of its own process, from its being ready to its end."""
+    return _running
 
 
 @pytest.fixture(scope="session")
