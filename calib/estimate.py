@@ -17,7 +17,7 @@ from polecal.calib.coverage import Need, Slice, coverage, slice_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
 from polecal.calib.observations import PARAMETERS, CalibrationError, Kind, Mount, Returns, axis_shift_m
-from polecal.calib.solve import UNKNOWNS, Scatter
+from polecal.calib.solve import EXTRAS, UNKNOWNS, Form, Scatter, ground_rows, pole_rows
 from polecal.calib.uncertainty import FEWEST_PASSES, from_model, jackknife
 
 MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
@@ -25,7 +25,8 @@ MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
 
 _LAST_PASSES = 3  # the rate of improvement is what these brought
 _FEWEST_POLE_RETURNS = 10
-_TELLING_S = 2e-3  # a time offset known no better than this, 1 cm at 5 m/s, is not told from x
+_TELLING = (2e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
+"""An extra known no better than this is not told: 1 cm at 5 m/s; 5 mm; 5 mm on a metre; 2 cm on ten."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +55,8 @@ class Setup:
     pole_radius_m: float = 0.0
     pass_error: bool = True
     """Whether each pass may have a navigation error of its own, which weighs it down; else Eq. 7 as it is."""
-    time_offset: bool = True
-    """Whether to look for a constant offset between the laser's time and the navigation's."""
+    extras: frozenset[str] = frozenset(EXTRAS)
+    """What of `solve.EXTRAS` to solve for, too, as far as the data can tell it."""
     hold: frozenset[str] = frozenset()
     criteria: Criteria = field(default_factory=Criteria)
     need: Need = field(default_factory=Need)
@@ -66,16 +67,16 @@ class Result:
     """A mount, and how far to trust it.
 
     ``sigma`` has the same names and units as the mount; of what is ``held`` it is the hand measurement's.
-    ``time_offset_s`` is by how much later than its stamps say the laser measured; it is 0 and its σ None
-    where it was not looked for, or could not be told from x.
+    ``extras`` are those of `solve.EXTRAS` that the data could tell, with their σ; the others are 0. A
+    ``time_s`` is by how much later than its stamps say the laser measured.
     ``covariance`` is (6, 6) in m and rad, order `PARAMETERS`. Costs are √c of Eq. 7 in m, after pole
     returns were moved to the pole's axis. ``improvement`` is by how much of itself √c over all data fell
     through the last passes, or None before there are enough.
     """
 
     mount: Mount
-    time_offset_s: float
-    time_offset_sigma_s: float | None
+    extras: dict[str, float]
+    extra_sigma: dict[str, float]
     cost_m: float
     measured_cost_m: float
     sigma: Mount
@@ -110,7 +111,7 @@ def calibrate(
     pole_radius_m: float = 0.0,
     *,
     pass_error: bool = False,
-    time_offset: bool = False,
+    extras: Collection[str] = (),
     measured_sigma: Mount = MEASURED_SIGMA,
     hold: Collection[str] = (),
     criteria: Criteria | None = None,
@@ -128,8 +129,8 @@ def calibrate(
         0 is the paper's cost to the letter; else pole returns are moved to the pole's axis.
     pass_error
         Let each pass have a navigation error of its own: not the paper's cost, and nearer to the truth.
-    time_offset
-        Solve for a constant offset in time, too; needs the returns' motion.
+    extras
+        Names of `solve.EXTRAS` to solve for, too; a time offset needs the returns' motion.
     measured_sigma
         What the hand measurement is worth: a parameter is held where the data know it no better.
     hold
@@ -152,7 +153,7 @@ def calibrate(
         measured_sigma=measured_sigma,
         pole_radius_m=pole_radius_m,
         pass_error=pass_error,
-        time_offset=time_offset and returns.motion is not None,
+        extras=frozenset(extras) - (set() if returns.motion is not None else {"time_s"}),
         hold=frozenset(hold),
         criteria=criteria or Criteria(),
         need=need,
@@ -167,8 +168,8 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     Raises CalibrationError where there are fewer than 10 pole returns.
     """
     poles, grounds = ([one.total(kind) for one in passes] for kind in (Kind.POLE, Kind.GROUND))
-    pole = Scatter(poles, axes=(0, 1), shift_m=axis_shift_m(setup.pole_radius_m), ranged=True)
-    ground = Scatter(grounds, axes=(2,))
+    pole = Scatter(poles, shift_m=axis_shift_m(setup.pole_radius_m), ranged=True)
+    ground = Scatter(grounds)
     returns = {Kind.POLE: int(pole.count.sum()), Kind.GROUND: int(ground.count.sum())}
     if returns[Kind.POLE] < _FEWEST_POLE_RETURNS:
         raise CalibrationError(
@@ -178,18 +179,18 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     every = np.ones(len(passes), dtype=bool)
     ratios = (np.inf, np.inf)
 
-    def form(used: NDArray[np.bool_]) -> Array:
-        return pole.form(used, ratios[0]) + ground.form(used, ratios[1])
+    def form(used: NDArray[np.bool_]) -> Form:
+        return Form(pole.form(used, ratios[0]), ground.form(used, ratios[1]))
 
-    paper_q = q = form(every)  # Eq. 7
-    measured = np.concatenate([setup.measured.vector, [0.0, 0.0]])
-    held = {*setup.hold, "range"} | (set() if setup.time_offset else {"time"})
+    paper = whole = form(every)  # Eq. 7
+    measured = np.concatenate([setup.measured.vector, np.zeros(len(EXTRAS))])
+    held = {*setup.hold, *EXTRAS} - setup.extras
     if setup.pass_error and len(passes) >= FEWEST_PASSES:
-        rough = solve.minimise(q, measured, held)
-        ratios = pole.ratio(rough), ground.ratio(rough)
-        q = form(every)
+        rough = solve.minimise(whole, measured, held)
+        ratios = pole.ratio(pole_rows(rough)), ground.ratio(ground_rows(rough))
+        whole = form(every)
     without = [form(every & (np.arange(len(passes)) != index)) for index in range(len(passes))]
-    measured_sigma = np.concatenate([setup.measured_sigma.vector, [_TELLING_S, np.inf]])
+    measured_sigma = np.concatenate([setup.measured_sigma.vector, _TELLING])
     # What the data know no better than the tape measure is not taken from them. On a flat pad z is nearly
     # free (paper.md, later work 4) and more passes hardly help: it must meet its own bound, or is held.
     believable = measured_sigma.copy()
@@ -197,10 +198,10 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     vector = measured
     while True:
         search = solve.minimise_globally if everywhere else solve.minimise
-        vector = search(q, np.where(_mask(held), measured, vector), held)
+        vector = search(whole, np.where(_mask(held), measured, vector), held)
         free = ~_mask(held)
-        told = solve.information(q, vector)
-        squared = solve.cost_m(q, vector) ** 2
+        _, told = whole.slope(vector)
+        squared = whole.cost(vector)
         if len(passes) < FEWEST_PASSES:
             covariance = from_model(told, squared, len(passes), free)
         else:
@@ -209,7 +210,7 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
         # tell at best can. Where the minimum is may hide it: off level the cosine of a level sensor's pitch
         # stretches the ranges, and noise puts it there. So the measured mount must be told from, too.
         at_best = [
-            np.diag(from_model(solve.information(q, at), squared, returns[Kind.POLE], free))
+            np.diag(from_model(whole.slope(at)[1], squared, returns[Kind.POLE], free))
             for at in (vector, measured)
         ]
         doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*at_best))) / believable
@@ -218,15 +219,18 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
             break
         held.add(UNKNOWNS[worst])
     mask = _mask(held)[:6]
-    time_sigma_s = float(np.sqrt(covariance[6, 6]))
+    spread = np.sqrt(np.diag(covariance))
+    told_extras = [
+        (index, name) for index, name in enumerate(UNKNOWNS) if name in EXTRAS and name not in held
+    ]
     covariance = covariance[:6, :6]
     covariance[mask, mask] = measured_sigma[:6][mask] ** 2
     sigma = np.sqrt(np.diag(covariance))
-    cost_m = solve.cost_m(paper_q, vector)
+    cost_m = solve.cost_m(paper, vector)
     improvement = None
     if len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
         before = solve.minimise(form(np.arange(len(passes)) < len(passes) - _LAST_PASSES), vector, held)
-        improvement = solve.cost_m(paper_q, before) / cost_m - 1.0 if cost_m else 0.0
+        improvement = solve.cost_m(paper, before) / cost_m - 1.0 if cost_m else 0.0
     slices = coverage([one.pole_returns for one in passes], setup.need)
     verdict = judge(
         criteria=setup.criteria,
@@ -242,10 +246,10 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     )
     return Result(
         mount=Mount.from_vector(vector[:6]),
-        time_offset_s=float(vector[6]),
-        time_offset_sigma_s=None if "time" in held else time_sigma_s,
+        extras={name: float(vector[index]) for index, name in told_extras},
+        extra_sigma={name: float(spread[index]) for index, name in told_extras},
         cost_m=cost_m,
-        measured_cost_m=solve.cost_m(paper_q, measured),
+        measured_cost_m=solve.cost_m(paper, measured),
         sigma=Mount.from_vector(sigma),
         covariance=covariance,
         held=tuple(name for name in PARAMETERS if name in held),

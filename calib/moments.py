@@ -48,19 +48,11 @@ class Moments:
     def __sub__(self, other: Moments) -> Moments:
         return Moments(self.count - other.count, self.first - other.first, self.second - other.second)
 
-    def mean(self, axis: int) -> Array:
-        """Give the (36,) mean of the features of one axis of n: mean = m h⁺, m."""
-        return self.first[_of(axis)] / max(1, self.count)
-
-    def covariance(self, axis: int) -> Array:
-        """Give the (36, 36) covariance of the features of one axis of n: var = h⁺ᵀ S h⁺, m²."""
-        mean = self.mean(axis)
-        covariance = self.second[_of(axis), _of(axis)] / max(1, self.count) - np.outer(mean, mean)
+    def covariance(self) -> Array:
+        """Give the covariance (108, 108) of the features, m²; of no returns, nothing."""
+        mean = self.first / max(1, self.count)
+        covariance = self.second / max(1, self.count) - np.outer(mean, mean)
         return (covariance + covariance.T) / 2
-
-
-def _of(axis: int) -> slice:
-    return slice(axis * WIDTH, (axis + 1) * WIDTH)
 
 
 def zero() -> Moments:

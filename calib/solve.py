@@ -1,12 +1,14 @@
 """Moments to the mount that minimises Eq. 7.
 
-All of Eq. 7 is one quadratic form c = h⁺ᵀ Q h⁺ (`moments`), so that a solution costs the same for a hundred
-returns and for a million. The unknowns are the six of the mount, a time offset and a range offset.
+All of Eq. 7 is quadratic in h⁺ (`moments`), so that a solution costs the same for a hundred returns and for
+a million. Beside the six of the mount it can be solved for what else shifts the cloud: a time offset between
+laser and navigation, a range offset of the reflector, a pole that leans, ground that slopes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
@@ -17,8 +19,10 @@ from polecal.calib.geometry import Array, roll_pitch_yaw, rotation, rotation_gra
 from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments
 from polecal.calib.observations import PARAMETERS
 
-UNKNOWNS = (*PARAMETERS, "time", "range")
-"""What can be solved for, in the order of every vector (8,) here: m, rad, s, m."""
+EXTRAS = ("time_s", "range_m", "lean_north", "lean_east", "slope_north", "slope_east")
+"""What else can be solved for: offsets, and metres per metre of height (pole) or way (ground)."""
+UNKNOWNS = (*PARAMETERS, *EXTRAS)
+"""The order of every vector (12,) here: m, rad, s, m and pure numbers."""
 
 _STEPS = 100
 _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
@@ -29,60 +33,103 @@ _TURNS_RAD = (0.0, np.pi / 2, np.pi, -np.pi / 2)
 class Scatter:
     """The spread of one kind of returns: within each pass, and of the passes' means.
 
-    Takes each pass's moments, and the axes of n whose variance counts (north and east of the pole, Eq. 5;
-    down of the ground, Eq. 6). ``shift_m`` is a range offset that is known; ``ranged`` says whether these
+    Takes each pass's moments. ``shift_m`` is a range offset that is known; ``ranged`` says whether these
     returns take part in one that is not.
     """
 
-    def __init__(
-        self, passes: Sequence[Moments], axes: Sequence[int], *, shift_m: float = 0.0, ranged: bool = False
-    ) -> None:
+    def __init__(self, passes: Sequence[Moments], *, shift_m: float = 0.0, ranged: bool = False) -> None:
         fold = np.eye(WIDTH)
         fold[RANGE, RANGE] *= ranged
         fold[RANGE, 0:6] = shift_m * np.eye(6)
+        three = np.kron(np.eye(3), fold)
         self.count = np.array([one.count for one in passes], dtype=np.float64)
-        self._axes = len(axes)
-        spread = [one.count * sum(one.covariance(axis) for axis in axes) for one in passes]
-        self._within = fold.T @ np.stack(spread) @ fold  # (P, 36, 36)
-        self._mean = np.stack([[one.mean(axis) for axis in axes] for one in passes]) @ fold  # (P, axes, 36)
+        self._mean = np.stack([one.first / max(1, one.count) for one in passes]) @ three  # (P, 108)
+        self._within = np.stack([one.count * (three.T @ one.covariance() @ three) for one in passes])
 
     def form(self, used: NDArray[np.bool_], ratio: float = np.inf) -> Array:
-        """Give the quadratic form (36, 36) of the used passes' variance in m².
+        """Give the covariance (108, 108) of the used passes' features, m².
 
         ``ratio`` is the variance within a pass over that of the error which all its returns share: a pass
         of n returns says no more of where its mean should be than n / (1 + n / ratio) independent ones.
-        Infinite: no error is shared, and the form is the variance of Eqs. 5 and 6 to the letter.
+        Infinite: no error is shared, and the variances are those of Eqs. 5 and 6 to the letter.
         """
         total = self.count[used].sum()
         if not total:
-            return np.zeros((WIDTH, WIDTH))
+            return np.zeros((3 * WIDTH, 3 * WIDTH))
         weight = self.count[used] / (1.0 + self.count[used] / ratio)
-        mean = self._mean[used]
-        apart = mean - np.tensordot(weight / weight.sum(), mean, axes=1)
-        between = np.tensordot(weight[:, None, None] * apart, apart, axes=((0, 1), (0, 1)))
-        form: Array = (self._within[used].sum(axis=0) + between) / total
+        apart = self._mean[used] - weight / weight.sum() @ self._mean[used]
+        form: Array = (self._within[used].sum(axis=0) + (weight[:, None] * apart).T @ apart) / total
         return form
 
-    def ratio(self, vector: Array) -> float:
-        """Estimate that ratio from the passes themselves, at ``vector`` (8,)."""
+    def means(self, rows: Array) -> Array:
+        """Give each pass's mean (P, k) in the given rows (k, 108): `_rows` of a vector."""
+        means: Array = self._mean @ rows.T
+        return means
+
+    def within(self, rows: Array) -> Array:
+        """Give each pass's variance within, (P,), m², the mean over the given rows (k, 108)."""
+        summed = np.einsum("ki,pij,kj->p", rows, self._within, rows)
+        within: Array = summed / np.maximum(1.0, self.count) / len(rows)
+        return within
+
+    def ratio(self, rows: Array) -> float:
+        """Estimate `form`'s ratio from the passes themselves."""
         there = self.count > 0
-        h = _h(vector)
-        count, mean = self.count[there], self._mean[there] @ h
+        count = self.count[there]
         if len(count) < 2:
             return np.inf
-        within = float(np.einsum("i,pij,j->", h, self._within[there], h)) / (count.sum() * self._axes)
-        apart = float(mean.var(axis=0, ddof=1).mean()) - within * float((1.0 / count).mean())
+        within = float((count * self.within(rows)[there]).sum() / count.sum())
+        apart = float(self.means(rows)[there].var(axis=0, ddof=1).mean()) - within * float((1 / count).mean())
         return within / apart if apart > 0 else np.inf
 
 
-def cost_m(q: Array, vector: Array) -> float:
-    """Give √c in m at ``vector`` (8,)."""
-    h = _h(vector)
-    return float(np.sqrt(max(0.0, float(h @ q @ h))))
+@dataclass(frozen=True, slots=True)
+class Form:
+    """Eq. 7 as a function of the unknowns: the covariances of both kinds' features, (108, 108) each."""
+
+    pole: Array
+    ground: Array
+
+    def cost(self, vector: Array) -> float:
+        """Give c in m² at ``vector`` (12,)."""
+        pole, ground = pole_rows(vector), ground_rows(vector)
+        c = np.einsum("ki,ij,kj->", pole, self.pole, pole) + np.einsum(
+            "ki,ij,kj->", ground, self.ground, ground
+        )
+        return max(0.0, float(c))
+
+    def slope(self, vector: Array) -> tuple[Array, Array]:
+        """Give half the gradient (12,) and half the Gauss-Newton Hessian (12, 12) of c."""
+        gradient, hessian = np.zeros(len(UNKNOWNS)), np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
+        h, dh = _h(vector), _h_gradient(vector)
+        for matrix, weights in ((self.pole, _pole_weights(vector)), (self.ground, _ground_weights(vector))):
+            for weight, dweight in zip(*weights, strict=True):
+                jacobian = np.kron(weight[:, None], dh) + np.kron(dweight, h[:, None])
+                pulled = matrix @ jacobian
+                gradient += pulled.T @ np.kron(weight, h)
+                hessian += jacobian.T @ pulled
+        return gradient, hessian
 
 
-def minimise(q: Array, start: Array, held: Collection[str] = ()) -> Array:
-    """Give the (8,) vector that minimises c from ``start``, the ``held`` ones of `UNKNOWNS` kept.
+def cost_m(form: Form, vector: Array) -> float:
+    """Give √c in m at ``vector`` (12,)."""
+    return float(np.sqrt(form.cost(vector)))
+
+
+def pole_rows(vector: Array) -> Array:
+    """Give what turns features into north and east of the pole, its lean taken off: (2, 108)."""
+    rows: Array = np.kron(_pole_weights(vector)[0], _h(vector))
+    return rows
+
+
+def ground_rows(vector: Array) -> Array:
+    """Give what turns features into down of the ground, its slope taken off: (1, 108)."""
+    rows: Array = np.kron(_ground_weights(vector)[0], _h(vector))
+    return rows
+
+
+def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:
+    """Give the (12,) vector that minimises c from ``start``, the ``held`` ones of `UNKNOWNS` kept.
 
     Levenberg-Marquardt on the numbers themselves; ends where no step lowers the cost any more.
     """
@@ -90,23 +137,20 @@ def minimise(q: Array, start: Array, held: Collection[str] = ()) -> Array:
     vector = start.astype(np.float64)
     if not free.any():
         return vector
-    h = _h(vector)
-    cost, damping = h @ q @ h, 1e-6
+    cost, damping = form.cost(vector), 1e-6
     for _ in range(_STEPS):
-        jacobian = _h_gradient(vector)[:, free]
-        hessian = jacobian.T @ q @ jacobian
-        gradient = jacobian.T @ (q @ h)
+        gradient, hessian = form.slope(vector)
+        gradient, hessian = gradient[free], hessian[np.ix_(free, free)]
         while damping < _GIVE_UP:
             step = np.zeros(len(UNKNOWNS))
             step[free] = -np.linalg.lstsq(_damped(hessian, damping), gradient, rcond=1e-15)[0]
-            candidate = _h(vector + step)
-            lower = candidate @ q @ candidate
+            lower = form.cost(vector + step)
             if lower < cost:
                 break
             damping *= _DAMPED
         else:
             return vector
-        vector, h = vector + step, candidate
+        vector = vector + step
         settled = np.abs(step).max() < 1e-11 and cost - lower <= 1e-14 * cost
         cost, damping = lower, max(damping * _EASED, 1e-12)
         if settled:
@@ -114,52 +158,46 @@ def minimise(q: Array, start: Array, held: Collection[str] = ()) -> Array:
     return vector
 
 
-def minimise_globally(q: Array, start: Array, held: Collection[str] = ()) -> Array:
+def minimise_globally(form: Form, start: Array, held: Collection[str] = ()) -> Array:
     """Give the lowest of the minima found from ``start`` and from it turned by right angles.
 
     The cost has false minima (paper.md, later work 6). Only rotations need be tried: for each the best
     position follows at once, as the cost is a parabola in r_b. What is held is never turned. Of equal
     minima the one next to ``start`` is taken.
     """
-    near = minimise(q, start, held)
+    near = minimise(form, start, held)
     if set(held) & {"roll", "pitch", "yaw"}:
         return near
-    lowest = min((minimise(q, turned, held) for turned in _turned(q, start, held)), key=partial(cost_m, q))
-    if cost_m(q, lowest) > _SAME * cost_m(q, near):
+    ends = (minimise(form, turned, held) for turned in _turned(form, start, held))
+    lowest = min(ends, key=partial(cost_m, form))
+    if cost_m(form, lowest) > _SAME * cost_m(form, near):
         return near
     lowest[3:6] = roll_pitch_yaw(rotation(lowest[3:6]))  # one of the two triples that mean the same rotation
     return lowest
 
 
-def information(q: Array, vector: Array) -> Array:
-    """Give half the Gauss-Newton Hessian of c, (8, 8): m² per the unknowns' units."""
-    jacobian = _h_gradient(vector)
-    return jacobian.T @ q @ jacobian
-
-
-def _turned(q: Array, start: Array, held: Collection[str]) -> Iterator[Array]:
+def _turned(form: Form, start: Array, held: Collection[str]) -> Iterator[Array]:
     free = [axis for axis in range(3) if UNKNOWNS[axis] not in held]
     for turn in list(product((0.0, np.pi), (0.0, np.pi / 2, -np.pi / 2), _TURNS_RAD))[1:]:
         vector = start.copy()
         vector[3:6] = roll_pitch_yaw(rotation(start[3:6]) @ rotation(np.array(turn)))
         if free:
-            jacobian = _h_gradient(vector)[:, free]
-            curvature, slope = jacobian.T @ q @ jacobian, jacobian.T @ q @ _h(vector)
-            vector[free] -= np.linalg.lstsq(curvature, slope, rcond=1e-9)[0]
+            gradient, hessian = form.slope(vector)
+            vector[free] -= np.linalg.lstsq(hessian[np.ix_(free, free)], gradient[free], rcond=1e-9)[0]
         yield vector
 
 
 def _h(vector: Array) -> Array:
     """Give h⁺ (36,)."""
-    time_s, range_m = vector[6:]
+    time_s, range_m = vector[6:8]
     columns = rotation(vector[3:6])[:, :2].T.ravel()
     h = np.concatenate([columns, vector[:3], [1.0]])
     return np.concatenate([h, range_m * columns, time_s * h, time_s**2 * h])
 
 
 def _h_gradient(vector: Array) -> Array:
-    """Give dh⁺/d(x y z roll pitch yaw time range), (36, 8)."""
-    time_s, range_m = vector[6:]
+    """Give the derivative of h⁺ by the unknowns, (36, 12)."""
+    time_s, range_m = vector[6:8]
     gradient = np.zeros((WIDTH, len(UNKNOWNS)))
     turned = rotation_gradient(vector[3:6])[:, :, :2].transpose(0, 2, 1).reshape(3, 6).T
     gradient[6:9, :3] = np.eye(3)
@@ -172,6 +210,20 @@ def _h_gradient(vector: Array) -> Array:
     gradient[TIME_SQUARED, 6] = 2 * time_s * h[BASE]
     gradient[RANGE, 7] = h[:6]
     return gradient
+
+
+def _pole_weights(vector: Array) -> tuple[Array, Array]:
+    """Give the weights of n's axes in north and east of the pole (2, 3), and their derivative (2, 3, 12)."""
+    gradient = np.zeros((2, 3, len(UNKNOWNS)))
+    gradient[0, 2, 8] = gradient[1, 2, 9] = 1.0
+    return np.array([[1.0, 0.0, vector[8]], [0.0, 1.0, vector[9]]]), gradient
+
+
+def _ground_weights(vector: Array) -> tuple[Array, Array]:
+    """Give the weights of n's axes in down of the ground (1, 3), and their derivative (1, 3, 12)."""
+    gradient = np.zeros((1, 3, len(UNKNOWNS)))
+    gradient[0, 0, 10] = gradient[0, 1, 11] = 1.0
+    return np.array([[vector[10], vector[11], 1.0]]), gradient
 
 
 def _damped(hessian: Array, damping: float) -> Array:

@@ -31,7 +31,7 @@ def jackknife(left_out: Array) -> Array:
 def from_model(information: Array, cost: float, observations: int, free: NDArray[np.bool_]) -> Array:
     """Give the covariance (n, n) that so many independent observations of variance ``cost`` (m²) allow.
 
-    Of the ``free`` parameters only, ``information`` (n, n) is `solve.information`. What the data say
+    Of the ``free`` parameters only, ``information`` (n, n) is half the Hessian of the cost. What the data say
     nothing about comes out with a huge variance, where a scatter would come out as nothing.
     """
     covariance = np.zeros_like(information)

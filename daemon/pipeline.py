@@ -291,7 +291,7 @@ class Pipeline:
             for laser in self._lasers.values()
             if laser.result is not None
             and laser.result.passes >= FEWEST_PASSES
-            and laser.result.time_offset_sigma_s is None
+            and "time_s" not in laser.result.extras
         ]
         return notes
 

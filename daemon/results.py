@@ -61,7 +61,7 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
             "measured_cost_m": None,
             "improvement": None,
             "time_offset_s": 0.0,
-            "time_offset_sigma_s": None,
+            "extras": {},
             "verdict": {"accepted": False, "reasons": ["no pass of the pole yet"]},
         }
     return {
@@ -75,8 +75,10 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
         "cost_m": result.cost_m,
         "measured_cost_m": result.measured_cost_m,
         "improvement": result.improvement,
-        "time_offset_s": result.time_offset_s,
-        "time_offset_sigma_s": result.time_offset_sigma_s,
+        "time_offset_s": result.extras.get("time_s", 0.0),
+        "extras": {
+            name: {"value": value, "sigma": result.extra_sigma[name]} for name, value in result.extras.items()
+        },
         "verdict": {"accepted": result.verdict.accepted, "reasons": list(result.verdict.reasons)},
     }
 

@@ -170,15 +170,14 @@ def at_speeds(returns, speeds_mps):
 
 def test_a_time_offset_is_held_at_zero_where_every_pass_is_driven_forward_at_one_speed(rig):
     returns = at_speeds(rig.drive(noise_m=0.01, nav_m=0.005), [3.0])
-    result = calibrate(returns, rig.measured, pass_error=True, time_offset=True)
-    assert result.time_offset_s == 0.0
-    assert result.time_offset_sigma_s is None
+    result = calibrate(returns, rig.measured, pass_error=True, extras=["time_s"])
+    assert result.extras == {}
     assert result.mount.x_m == pytest.approx(rig.true.x_m + 0.06, abs=0.01), "it looks like x"
 
 
 def test_a_time_offset_is_told_from_x_by_passes_in_reverse(rig):
     returns = at_speeds(rig.drive(noise_m=0.01, nav_m=0.005), [3.0, -2.0, 1.0])
-    result = calibrate(returns, rig.measured, pass_error=True, time_offset=True)
-    assert result.time_offset_s == pytest.approx(0.02, abs=0.002)
-    assert result.time_offset_sigma_s < 0.002
+    result = calibrate(returns, rig.measured, pass_error=True, extras=["time_s"])
+    assert result.extras["time_s"] == pytest.approx(0.02, abs=0.002)
+    assert result.extra_sigma["time_s"] < 0.002
     assert result.mount.x_m == pytest.approx(rig.true.x_m, abs=0.01)

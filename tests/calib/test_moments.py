@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from polecal.calib import Kind, Mount, cost
 from polecal.calib import moments as m
 from polecal.calib.geometry import roll_pitch_yaw, rotation
-from polecal.calib.solve import Scatter, cost_m
+from polecal.calib.solve import Form, Scatter, cost_m
 
 
 @pytest.fixture(scope="module")
@@ -18,8 +18,9 @@ def returns(rig):
 def cost_from_moments(pole, ground, mount, *, radius_m=0.0, time_s=0.0):
     """√c of Eq. 7 of one pass."""
     every = np.array([True])
-    q = Scatter([pole], (0, 1), shift_m=np.pi / 4 * radius_m, ranged=True).form(every)
-    return cost_m(q + Scatter([ground], (2,)).form(every), np.array([*mount.vector, time_s, 0.0]))
+    scatter = Scatter([pole], shift_m=np.pi / 4 * radius_m, ranged=True)
+    form = Form(scatter.form(every), Scatter([ground]).form(every))
+    return cost_m(form, np.array([*mount.vector, time_s, *[0.0] * 5]))
 
 
 def split(returns):
@@ -71,4 +72,4 @@ def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):
 
 def test_no_returns_cost_nothing():
     assert m.zero().count == 0
-    assert not m.zero().covariance(0).any()
+    assert not m.zero().covariance().any()
