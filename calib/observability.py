@@ -16,7 +16,15 @@ from polecal.calib.geometry import Array, rotation, rotation_gradient
 from polecal.calib.observations import PARAMETERS, Kind, Mount, Returns
 
 _AXES = {Kind.POLE: (0, 1), Kind.GROUND: (2,)}  # Eqs. 5 and 6
-_NAMES = (*PARAMETERS, "time offset", "range offset")
+_WORDS = {
+    "time_s": "the time offset",
+    "range_m": "the range offset",
+    "lean_north": "the pole's lean north",
+    "lean_east": "the pole's lean east",
+    "slope_north": "the ground's slope north",
+    "slope_east": "the ground's slope east",
+}
+"""Of `solve.EXTRAS`, as an operator reads them; the six are called by their names."""
 _SHARE = 0.35  # what has less of a direction than this, of its largest part, is not named in it
 _NOTHING = 1e-9
 
@@ -36,23 +44,25 @@ class Direction:
     """What would make it better known."""
 
 
-_FORWARD = "pass the pole heading the other way"
+_OTHER_WAY = "pass the pole heading the other way"
 _UNEVEN = "drive over uneven ground, or tilt the vehicle: planks under the wheels of one side"
-_SPEED = "pass the pole in reverse, or at another speed"
-_LEVEL = "tilt the laser so that it sees more of the ground, or take the measured values"
-_DRIVES: tuple[tuple[frozenset[str], frozenset[str], str], ...] = (
-    (frozenset({"time offset"}), frozenset(_NAMES), _SPEED),
-    (frozenset({"range offset"}), frozenset(_NAMES), "pass the pole on both sides, near and far"),
-    (frozenset({"z"}), frozenset({"z", "roll", "pitch"}), _UNEVEN),
-    (frozenset({"z"}), frozenset({"x", "y", "z"}), f"{_FORWARD}; {_UNEVEN}"),
+_DRIVES: tuple[tuple[set[str], set[str] | None, str], ...] = (
+    ({"time_s"}, None, "pass the pole in reverse, or at another speed"),
+    ({"range_m"}, None, "pass the pole on both sides, near and far"),
+    ({"lean_north"}, None, "pass the pole near and far, so that the laser meets it low and high"),
+    ({"lean_east"}, None, "pass the pole near and far, so that the laser meets it low and high"),
+    ({"slope_north"}, None, _OTHER_WAY),
+    ({"slope_east"}, None, _OTHER_WAY),
+    ({"z"}, {"z", "roll", "pitch"}, _UNEVEN),
+    ({"z"}, {"x", "y", "z"}, f"{_OTHER_WAY}; {_UNEVEN}"),
+    ({"roll", "yaw"}, {"roll", "yaw"}, "take one of the two as measured: they are the same turn"),
     (
-        frozenset({"roll", "yaw"}),
-        frozenset({"roll", "yaw"}),
-        "take one of the two as measured: they are one turn",
+        set(),
+        {"roll", "pitch"},
+        "tilt the laser so that it sees more of the ground, or take the measured values",
     ),
-    (frozenset(), frozenset({"roll", "pitch"}), _LEVEL),
-    (frozenset(), frozenset({"x", "y"}), _FORWARD),
-    (frozenset(), frozenset({"x", "y", "yaw"}), f"{_FORWARD}, and on its other side, near and far"),
+    (set(), {"x", "y"}, _OTHER_WAY),
+    (set(), {"x", "y", "yaw"}, f"{_OTHER_WAY}, and on its other side, near and far"),
 )
 """What a direction must have in it, what it may have in it, and the drive for it; the first that fits."""
 _OTHERWISE = "pass the pole in other ways: from other sides, nearer and farther, over uneven ground"
@@ -94,43 +104,44 @@ def can_be_found(information: Array) -> NDArray[np.bool_]:
     return found
 
 
-def weak_directions(information: Array, scale: Array) -> list[Direction]:
+def weak_directions(information: Array, scale: Array, names: Sequence[str] = PARAMETERS) -> list[Direction]:
     """Give the combinations of unknowns that the data tell apart, the weakest first.
 
     Parameters
     ----------
     information
-        (n, n) inverse of a covariance: of the six unknowns, or with the time offset (s) as the seventh and
-        the range offset (m) as the eighth.
+        (n, n) inverse of a covariance of the unknowns, in m and rad (s).
     scale
-        (n,) what is known of each without the data, σ: the hand measurement's, in m and rad.
+        (n,) what is known of each without the data, σ: the hand measurement's.
+    names
+        What they are, of `solve.UNKNOWNS`.
     """
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     directions = []
     for value, vector in zip(values, vectors.T, strict=True):
-        largest = np.abs(vector).max()
-        parts = [name for name, part in zip(_NAMES, vector, strict=False) if abs(part) > _SHARE * largest]
+        size = np.abs(vector)
+        parts = [name for name, part in zip(names, size, strict=True) if part > _SHARE * size.max()]
         sigma = float(1.0 / np.sqrt(max(value, _NOTHING**2)))
-        step = sigma * scale * vector * np.sign(vector[np.argmax(np.abs(vector))])
-        directions.append(Direction(sigma, step, _together(parts), _drive(frozenset(parts))))
+        step = sigma * scale * vector * np.sign(vector[size.argmax()])
+        directions.append(Direction(sigma, step, _together(parts), _drive(set(parts))))
     return directions
 
 
 def _together(parts: Sequence[str]) -> str:
     """Name a combination: z; roll and pitch together; x together with the time offset."""
-    plain = [name for name in parts if name in PARAMETERS]
-    offsets = [f"the {name}" for name in parts if name not in PARAMETERS]
-    names, others = (
-        " and ".join([", ".join(some[:-1]), some[-1]]) if len(some) > 1 else "".join(some)
-        for some in (plain, offsets)
-    )
-    if names and others:
-        return f"{names} together with {others}"
-    return f"{names} together" if len(plain) > 1 else names or others
+    mount = _listed([name for name in parts if name not in _WORDS])
+    extras = _listed([_WORDS[name] for name in parts if name in _WORDS])
+    if mount and extras:
+        return f"{mount} together with {extras}"
+    return f"{mount or extras}{' together' * (len(parts) > 1)}"
 
 
-def _drive(parts: frozenset[str]) -> str:
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def _drive(parts: set[str]) -> str:
     for needed, allowed, drive in _DRIVES:
-        if needed <= parts <= allowed:
+        if needed <= parts and (allowed is None or parts <= allowed):
             return drive
     return _OTHERWISE

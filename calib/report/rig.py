@@ -68,7 +68,7 @@ class _Scans:
 
 
 def drive(rig: Rig, rng: np.random.Generator, pole_returns: int, ground_returns: int) -> Returns:
-    """Give exactly so many returns, drawn evenly from all that the rig's drive gives.
+    """Give exactly so many returns of each kind, drawn evenly from all of a drive, in their order.
 
     Raises CalibrationError where it gives fewer.
     """
@@ -213,7 +213,7 @@ def _ground(
     origin, columns = scans.sees(rig.mount)
     beams = round(2 * rig.half_fov_deg / rig.resolution_deg) + 1
     every = len(origin) * beams
-    drawn = rng.choice(every, min(every, 2 * wanted), replace=False, shuffle=False)
+    drawn = np.sort(rng.choice(every, min(every, 2 * wanted), replace=False, shuffle=False))
     scan, beam = np.divmod(drawn, beams)
     bearing = np.radians(rig.half_fov_deg - rig.resolution_deg * beam)
     down = _along(columns[scan], bearing)[:, 2]

@@ -9,7 +9,7 @@ from polecal.calib import moments as m
 from polecal.calib.observability import can_be_found, information, sensitivity, weak_directions
 from polecal.calib.report.rig import Rig, drive
 
-HAND_SIGMA = np.array([0.1, 0.1, 0.1, *np.radians([5.0, 5.0, 5.0]), 0.02, 0.02])
+HAND_SIGMA = np.array([0.1, 0.1, 0.1, *np.radians([5.0, 5.0, 5.0]), 0.02, 0.02, *[0.02] * 4])
 SLANTED = Mount(0.0, -0.35, -1.0, 0.0, -8.0, 0.0)
 ROLL, PITCH, YAW = 3, 4, 5
 
@@ -37,14 +37,17 @@ def from_moments(returns, mount, unknowns, *, cost_m=0.03):
     """Inverse covariance of the first so many unknowns, were all returns independent."""
     pole = returns.kind == Kind.POLE
     every = np.array([True])
-    q = solve.Scatter([m.of(returns[pole])], (0, 1), ranged=True).form(every)
-    q = q + solve.Scatter([m.of(returns[~pole])], (2,)).form(every)
-    told = solve.information(q, np.array([*mount.vector, 0.0, 0.0]))
-    return told[:unknowns, :unknowns] * len(returns) / cost_m**2
+    form = solve.Form(
+        solve.Scatter([m.of(returns[pole])], ranged=True).form(every),
+        solve.Scatter([m.of(returns[~pole])]).form(every),
+    )
+    vector = np.concatenate([mount.vector, np.zeros(len(solve.EXTRAS))])
+    return form.slope(vector)[1][:unknowns, :unknowns] * len(returns) / cost_m**2
 
 
 def weakest(returns, mount, unknowns=6):
-    return weak_directions(from_moments(returns, mount, unknowns), HAND_SIGMA[:unknowns])
+    told = from_moments(returns, mount, unknowns)
+    return weak_directions(told, HAND_SIGMA[:unknowns], solve.UNKNOWNS[:unknowns])
 
 
 @pytest.mark.parametrize("mount", [SLANTED, Mount(0.4, 0.2, -0.7, 25, 140, -100), Mount(0, 0, 0, 90, -90, 9)])
@@ -170,3 +173,13 @@ def test_roll_and_yaw_of_a_sensor_that_looks_straight_down_are_one_turn():
     assert first.name == "roll and yaw together"
     assert first.drive.startswith("take one of the two as measured")
     assert abs(first.step[ROLL]) == pytest.approx(abs(first.step[YAW]))
+
+
+def test_a_leaning_pole_and_sloping_ground_have_names_and_a_drive():
+    names = ("lean_north", "slope_east")
+    lean, slope = weak_directions(np.diag([1.0, 100.0]), np.ones(2), names)
+    assert lean.name == "the pole's lean north"
+    assert "low and high" in lean.drive
+    assert slope.name == "the ground's slope east"
+    both = weak_directions(np.array([[1.0, 0.99], [0.99, 1.0]]), np.ones(2), ("y", "lean_east"))
+    assert both[0].name == "y together with the pole's lean east"
