@@ -43,18 +43,13 @@ class Configuration:
         """0 cm, 1 mm."""
         return self.data[_UNIT]
 
-    def streaming(self, measuring_mode: int) -> Self:
-        """Return this with the measuring mode, cm, and real-time indices on; all else as it is."""
+    def streaming(self, measuring_mode: int, unit: int = CENTIMETRES) -> Self:
+        """Return this with the measuring mode, the unit, and real-time indices on; all else as it is."""
         data = bytearray(self.data)
         data[_AVAILABILITY] |= REAL_TIME_INDICES
         data[_MEASURING_MODE] = measuring_mode
-        data[_UNIT] = CENTIMETRES
+        data[_UNIT] = unit
         return type(self)(bytes(data))
-
-    def same(self, other: Configuration) -> bool:
-        """Whether both say the same, as far as both go."""
-        size = min(len(self.data), len(other.data))
-        return self.data[:size] == other.data[:size]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,8 @@ from polecal.drivers.device import Device
 from polecal.drivers.errors import DeviceError, DeviceLost, DeviceNotFound, DeviceProtocolError
 from polecal.drivers.port import Chunk, Port, Tap
 from polecal.drivers.sick_lms.configuration import (
+    CENTIMETRES,
+    MILLIMETRES,
     Configuration,
     ConfigurationRead,
     ConfigurationWritten,
@@ -26,7 +28,7 @@ from polecal.drivers.sick_lms.conversation import (
 )
 from polecal.drivers.sick_lms.framer import Frame
 from polecal.drivers.sick_lms.health import Errors, Status
-from polecal.drivers.sick_lms.scans import SCAN_CODES
+from polecal.drivers.sick_lms.scans import MAX_RANGE_M, MEASURING_MODES, SCAN_CODES
 from polecal.drivers.sick_lms.telegrams import (
     BAUD_MODES,
     POLLUTED,
@@ -45,6 +47,7 @@ from polecal.drivers.sick_lms.telegrams import (
 )
 
 Reflectivity = Literal["levels", "energy", "s14"]
+Unit = Literal["cm", "mm"]
 
 _RATES = (500000, 38400, 19200, 9600)
 _ROUNDS = 6  # through all rates; the laser overlooks a request now and then
@@ -57,17 +60,33 @@ _LEVELS_MODE = 0x01  # measuring modes, sheet section 3.3
 _ENERGY_MODE = 0x0E
 _ENERGY_BEAMS = 199  # what fits an F5 of 814 bytes with indices (sheet section 5)
 _ONE_IN = {38400: 5, 19200: 9, 9600: 17}  # scans of 0.25 degrees that get through (sheet section 6)
+_UNITS = {"cm": 0.01, "mm": 0.001}
 _S14 = "S14"
 _S14_BEAMS = 181
 _NOVATEL_MARKS = (b"\xaa\x44", b"#", b"<OK", b"$GP")
 
 
-def refusal(fov_deg: float, resolution_deg: float, reflectivity: str, baud: int) -> str:
-    """Why no laser can do this, in words; empty if one can (sheet sections 5 and 7)."""
+def refusal(
+    fov_deg: float,
+    resolution_deg: float,
+    reflectivity: str,
+    baud: int,
+    unit: str = "cm",
+    max_range_m: float = 80.0,
+) -> str:
+    """Why no laser can do this, in words; empty if one can (sheet sections 3.3, 5 and 7)."""
     if baud not in BAUD_MODES:
         return f"the laser knows {', '.join(map(str, sorted(BAUD_MODES)))} bit/s, not {baud}"
     if reflectivity not in ("levels", "energy", "s14"):
         return f"reflectivity is levels, energy or s14, not {reflectivity}"
+    if unit not in _UNITS:
+        return f"the laser's unit is cm or mm, not {unit}"
+    mode = _ENERGY_MODE if reflectivity == "energy" else _LEVELS_MODE
+    largest_m = min(((1 << MEASURING_MODES[mode].range_bits) - 9) * _UNITS[unit], MAX_RANGE_M)
+    if max_range_m > largest_m:
+        return (
+            f"in {unit} the laser's numbers end at {largest_m:.2f} m, not {max_range_m:g} m: use cm, or less"
+        )
     if reflectivity == "s14":
         fits = (fov_deg, resolution_deg) == (90, 0.5)
         return "" if fits else "an S14 laser sees 90° at 0.5° and nothing else"
@@ -118,9 +137,11 @@ class SickLms(Device):
         resolution_deg: float = 0.25,
         reflectivity: Reflectivity = "levels",
         resting_baud: int = 9600,
+        unit: Unit = "cm",
+        max_range_m: float = 80.0,
     ) -> None:
         super().__init__(name, path, baud, tap)
-        reason = refusal(fov_deg, resolution_deg, reflectivity, baud)
+        reason = refusal(fov_deg, resolution_deg, reflectivity, baud, unit, max_range_m)
         if not reason and resting_baud not in BAUD_MODES:
             reason = f"the laser cannot rest at {resting_baud} bit/s"
         if reason:
@@ -129,6 +150,7 @@ class SickLms(Device):
         self.resolution_deg = resolution_deg
         self.reflectivity: Reflectivity = reflectivity
         self.resting_baud = resting_baud
+        self.unit: Unit = unit
         self.measuring_mode = _LEVELS_MODE
         self.eeprom_writes = 0
         self.health = Health()
@@ -242,7 +264,7 @@ class SickLms(Device):
         Raises NotConfigured.
         """
         now = talk.ask(RequestConfiguration(), ConfigurationRead).configuration
-        wanted = now.streaming(measuring_mode)
+        wanted = now.streaming(measuring_mode, MILLIMETRES if self.unit == "mm" else CENTIMETRES)
         self.measuring_mode = measuring_mode
         if wanted == now:
             return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cache
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -17,6 +18,7 @@ from polecal.drivers.sick_lms.telegrams import build
 REVOLUTION_S = 0.01332  # sheet section 6: 75 Hz nominal
 MAX_RANGE_M = 81.83  # the largest value word of the 80 m laser, in cm
 FULL_ENERGY = 13000  # sheet section 5: the most that an F5 reflectivity word is known to say
+DULL_ENERGY = 7000  # section 3.3: what the dullest surface sends back, in words that are not normalised
 _MAX_ENERGY = 32759  # beyond it the word is a code (sheet section 5, FAIR)
 
 _COUNT = 0x03FF  # header word, sheet section 4
@@ -82,8 +84,7 @@ MEASURING_MODES = {  # sheet section 3.3
     0x0F: MeasuringMode(15, False),
     0x3F: MeasuringMode(0, False),
 }
-_ENERGY_WORDS = 0x3F
-_RANGE_AND_ENERGY = 0x0E
+_NORMALISED, _UNNORMALISED, _IMMEDIATE, _ENERGY_WORDS = 0x0D, 0x0E, 0x0F, 0x3F
 
 
 class Decoded(NamedTuple):
@@ -108,7 +109,7 @@ class Scan:
     reflectivity numbers where the telegram has them (F5 words, C4 bytes). ``partial`` is 0 to 3 for an
     interlaced partial scan at .00, .25, .50, .75 degrees. ``spans`` are the first and last beam number
     (from 1) of each part, of the reflectivity bytes in C4; empty for a whole scan. ``mean_of`` is the
-    number of scans averaged.
+    number of scans averaged. ``interlaced`` is true of a partial scan and of the whole one made of four.
     """
 
     code: int
@@ -121,6 +122,7 @@ class Scan:
     energy: NDArray[np.uint16] | None = None
     spans: tuple[tuple[int, int], ...] = ()
     mean_of: int | None = None
+    interlaced: bool = False
 
     @property
     def count(self) -> int:
@@ -174,6 +176,7 @@ class Scan:
             energy,
             spans,
             before[0] if len(before) % 2 else None,
+            bool(header & _PARTIAL),
         )
 
     @classmethod
@@ -248,48 +251,60 @@ def _indices(body: bytes, at: int) -> tuple[int, int] | tuple[None, None]:
 def decode(scan: Scan, measuring_mode: int) -> Decoded:
     """Split the value words as the measuring mode (configuration byte D) says; sheet section 3.3.
 
-    F5 words are split as in mode 0Eh, whatever the mode. Raises DeviceProtocolError for a mode that the
-    sheet does not have.
+    F5 words are split as in mode 0Eh unless the mode is 0Dh, and those of interlaced scans as in 0Fh,
+    whatever the mode: so the laser sends them. Raises DeviceProtocolError for a mode that the sheet does
+    not have.
     """
-    try:
-        mode = MEASURING_MODES[_RANGE_AND_ENERGY if scan.code == ENERGY else measuring_mode]
-    except KeyError:
-        raise DeviceProtocolError(
-            f"measuring mode {measuring_mode:02X} is unknown: value words cannot be read"
-        ) from None
-    size, words = scan.count, scan.values
-    if measuring_mode == _ENERGY_WORDS and scan.code != ENERGY:
-        return Decoded(
-            np.full(size, np.nan),
-            np.full(size, NoRange.ENERGY_ONLY, np.uint8),
-            _scaled(words, FULL_ENERGY),
-            np.zeros(size, np.uint8),
-        )
+    if scan.code == ENERGY:
+        mode = _NORMALISED if measuring_mode == _NORMALISED else _UNNORMALISED
+    else:
+        mode = _IMMEDIATE if scan.interlaced else measuring_mode
+    if mode not in MEASURING_MODES:
+        raise DeviceProtocolError(f"measuring mode {mode:02X} is unknown: value words cannot be read")
+    every = _decoded_words(mode, scan.unit_m)
+    words = scan.values.astype(np.intp)
+    reflectivity: NDArray[np.float64]
+    if scan.code == S14:
+        assert scan.energy is not None
+        ((first, last),) = scan.spans
+        reflectivity = np.full(scan.count, np.nan)
+        reflectivity[first - 1 : last] = scan.energy[first - 1 : last] / 0xFF
+    elif scan.energy is not None:
+        reflectivity = _scaled(scan.energy, DULL_ENERGY if mode == _UNNORMALISED else 0)
+    else:
+        reflectivity = every.reflectivity[words]
+    return Decoded(every.ranges_m[words], every.kinds[words], reflectivity, every.flags[words])
+
+
+@cache
+def _decoded_words(measuring_mode: int, unit_m: float) -> Decoded:
+    """Read each of the 65536 value words, once; scans look theirs up."""
+    mode = MEASURING_MODES[measuring_mode]
+    words: NDArray[np.uint16] = np.arange(1 << 16, dtype=np.uint16)
+    if measuring_mode == _ENERGY_WORDS:
+        kinds = np.full(words.size, NoRange.ENERGY_ONLY, np.uint8)
+        nowhere, no_flags = np.full(words.size, np.nan), np.zeros(words.size, np.uint8)
+        return Decoded(nowhere, kinds, _scaled(words, 0), no_flags)
     top = (1 << mode.range_bits) - 1
     numbers = (words & top).astype(np.int32)
     flags = (words >> mode.range_bits).astype(np.uint8)
-    ranges_m: NDArray[np.float64] = numbers.astype(np.float64) * scan.unit_m
-    reflectivity: NDArray[np.float64] = np.full(size, np.nan)
+    ranges_m: NDArray[np.float64] = numbers.astype(np.float64) * unit_m
     # in 15 bits and cm the word could say more than the laser can see
     kinds = np.where(ranges_m >= MAX_RANGE_M, NoRange.BEYOND_MAXIMUM, NoRange.RANGE).astype(np.uint8)
     code = numbers - (top + 1 - len(_CODES))
     coded = code >= 0
     kinds[coded] = _CODES[code[coded]]
     ranges_m[kinds != NoRange.RANGE] = np.nan
-    if scan.code == S14:
-        assert scan.energy is not None
-        ((first, last),) = scan.spans
-        reflectivity[first - 1 : last] = scan.energy[first - 1 : last] / 0xFF
-    elif scan.energy is not None:
-        reflectivity = _scaled(scan.energy, FULL_ENERGY)
-    elif mode.levels:
+    reflectivity: NDArray[np.float64] = np.full(words.size, np.nan)
+    if mode.levels:
         reflectivity = flags.astype(np.float64) / ((1 << 16 - mode.range_bits) - 1)
     return Decoded(ranges_m, kinds, reflectivity, flags)
 
 
-def _scaled(energy: NDArray[np.uint16], full: int) -> NDArray[np.float64]:
+def _scaled(energy: NDArray[np.uint16], dullest: int) -> NDArray[np.float64]:
     """Energy words to 0 to 1; NaN for what is a code and no energy."""
-    scaled: NDArray[np.float64] = np.minimum(energy / full, 1.0)
+    scaled: NDArray[np.float64] = (energy.astype(np.float64) - dullest) / (FULL_ENERGY - dullest)
+    scaled = scaled.clip(0.0, 1.0)
     scaled[energy > _MAX_ENERGY] = np.nan
     return scaled
 

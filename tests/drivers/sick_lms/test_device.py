@@ -436,6 +436,10 @@ def test_nothing_found_says_what_was_heard(laser, sound, said, monkeypatch):
         ({"reflectivity": "s14"}, "S14"),
         ({"reflectivity": "colour"}, "colour"),
         ({"resting_baud": 4800}, "4800"),
+        ({"unit": "mm"}, "8.18 m, not 80 m"),
+        ({"unit": "mm", "reflectivity": "energy", "resolution_deg": 1}, "32.76 m, not 80 m"),
+        ({"max_range_m": 150}, "81.83 m, not 150 m"),
+        ({"unit": "inch"}, "inch"),
     ],
 )
 def test_what_no_laser_can_do_is_refused_with_the_reason(options, why):

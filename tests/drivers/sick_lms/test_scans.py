@@ -1,5 +1,7 @@
 """Measurements: values, overflow codes, reflectivity, bearings and the age of beams."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,12 +67,12 @@ def test_the_sheets_overflow_telegram_has_each_code_once(usable):
 def test_no_code_and_nothing_beyond_the_maximum_is_ever_a_range(modes, bits, unit_m):
     words = np.arange(1 << 16, dtype=np.uint16)
     for mode in modes:
-        decoded = decode(scan(words, unit_m=unit_m), mode)
+        decoded = decode(scan(words, unit_m=unit_m, interlaced=mode == 0x0F), mode)
         number = words & (1 << bits) - 1
         good = (number < (1 << bits) - 9) & (number * unit_m < 81.83)
         assert ((decoded.kinds == NoRange.RANGE) == good).all()
         assert (np.isnan(decoded.ranges_m) == ~good).all()
-        assert decoded.ranges_m[good] == pytest.approx(number[good] * unit_m)
+        np.testing.assert_allclose(decoded.ranges_m[good], number[good] * unit_m)
         assert (decoded.flags == words >> bits).all()
 
 
@@ -92,6 +94,19 @@ def test_energy_instead_of_ranges_is_no_range():
     assert (decoded.kinds == NoRange.ENERGY_ONLY).all()
     assert np.isnan(decoded.ranges_m).all()
     assert decoded.reflectivity == pytest.approx([0, 0.5, 1, 1])
+
+
+def test_interlaced_scans_have_15_bits_of_range_and_no_levels_whatever_mode_is_set(usable):
+    names = [f"B0h interlaced partial scan .{part} deg (constructed)" for part in ("00", "25", "50", "75")]
+    parts = [scan_of(usable[name]) for name in names]
+    far = parts[1].values | 0x4000
+    interlace = Interlace()
+    for part in (parts[0], replace(parts[1], values=far), parts[2], parts[3]):
+        joined = interlace.feed(part)
+    for one, values in ((replace(parts[1], values=far), far), (joined, joined.values)):
+        decoded = one.decode(0x01)
+        assert decoded.ranges_m == pytest.approx(values * 0.001)
+        assert np.isnan(decoded.reflectivity).all()
 
 
 def test_an_unknown_measuring_mode_is_refused():
@@ -121,7 +136,10 @@ def test_pairs_of_range_and_energy_keep_the_lasers_own_numbers(usable):
     decoded = pairs.decode(0x0E)
     assert decoded.ranges_m[:2] == pytest.approx([1.5, 1.501])
     assert decoded.kinds.tolist() == [0, 0, NoRange.NO_STOP_PULSE]
-    assert decoded.reflectivity == pytest.approx([7000 / 13000, 12000 / 13000, 0])
+    assert decoded.reflectivity == pytest.approx([0, 5 / 6, 0])  # 7000 to 13000 as received
+    normalised = pairs.decode(0x0D)
+    assert normalised.reflectivity == pytest.approx([7000 / 13000, 12000 / 13000, 0])
+    assert normalised.ranges_m[:2] == pytest.approx([1.5, 1.501])
 
 
 def test_several_spans_of_energy_are_read_and_built():
