@@ -11,16 +11,26 @@ from polecal.drivers.novatel_span.enums import (
     TimeStatus,
 )
 from polecal.drivers.novatel_span.framer import Fault, Frame, Framer, Kind, Skip
-from polecal.drivers.novatel_span.logs import BestPos, InsPva, InsPvax, Time, Version, parse
-from polecal.drivers.novatel_span.nav import Deduplicator, NavState, nav_state, reference_point
+from polecal.drivers.novatel_span.logs import BestPos, InsConfig, InsPva, InsPvax, Time, Version, parse
+from polecal.drivers.novatel_span.nav import (
+    Accuracy,
+    Deduplicator,
+    NavState,
+    accuracy,
+    nav_state,
+    position_type,
+    reference_point,
+)
 
 __all__ = [
+    "Accuracy",
     "BestPos",
     "Deduplicator",
     "Describer",
     "Fault",
     "Frame",
     "Framer",
+    "InsConfig",
     "InsPva",
     "InsPvax",
     "InsStatus",
@@ -34,8 +44,10 @@ __all__ = [
     "Time",
     "TimeStatus",
     "Version",
+    "accuracy",
     "columns",
     "nav_state",
     "parse",
+    "position_type",
     "reference_point",
 ]

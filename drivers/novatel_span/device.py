@@ -11,7 +11,7 @@ import contextlib
 import re
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from polecal.drivers.device import Device
 from polecal.drivers.errors import DeviceError, DeviceNotFound, DeviceProtocolError
@@ -20,30 +20,20 @@ from polecal.drivers.novatel_span.enums import FINE_TIME, Component, MessageId, 
 from polecal.drivers.novatel_span.framer import Frame, Framer, Kind
 from polecal.drivers.novatel_span.logs import InsConfig, Response, Version, parse
 from polecal.drivers.novatel_span.nav import reference_point
-from polecal.drivers.port import BITS_PER_BYTE, Chunk, Port, Tap
+from polecal.drivers.novatel_span.requests import (
+    FIXES,
+    PERIODS_S,
+    POSES,
+    QUALITIES,
+    generation,
+    refusal,
+    slow_logs,
+    worth_asking,
+)
+from polecal.drivers.port import Chunk, Port, Tap
 
 RATES = (115200, 9600, 230400, 57600, 38400, 19200, 460800, 921600)
 """Rates at which a receiver is looked for after the configured one, the likely ones first, bit/s."""
-
-PERIODS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.5)
-"""ONTIME periods below 1 s that a receiver takes; above, whole seconds (sheet section 5)."""
-
-FRAME_BYTES = {
-    MessageId.INSPVAS: 104,
-    MessageId.INSPVAX: 158,
-    MessageId.BESTPOS: 104,
-    MessageId.TIME: 76,
-}
-"""What a log takes on the line (sheet section 5)."""
-
-POSES = (MessageId.INSPVAS, MessageId.INSPVAX)
-"""The pose logs, in the order in which they are asked for."""
-
-SLOW_LOGS = (MessageId.BESTPOS, MessageId.TIME)
-"""The logs that are asked for once a second besides."""
-
-USABLE = 0.95
-"""How much of the line the logs may fill."""
 
 _ABOUT_ITSELF = (MessageId.VERSION, MessageId.INSCONFIG)
 _PORT_OF_ADDRESS = {1: "COM1", 2: "COM2", 3: "COM3"}  # a header's port address // 32 (sheet 3.6)
@@ -93,18 +83,27 @@ class NovatelSpan(Device):
             raise
 
     def _start(self, port: Port, talk: _Talk, period_s: float) -> None:
-        self._ask(talk, log(MessageId.INSCONFIG, Trigger.ONCE))  # OEM7 has it, others may refuse
+        of = generation(talk.version)
+        for message in worth_asking([MessageId.INSCONFIG], of):
+            self._ask(talk, log(message, Trigger.ONCE))
         self.pose = self._request_pose(talk, port, period_s)
-        for message in SLOW_LOGS:
-            command = log(message, Trigger.ONTIME, 1.0)
-            if (answer := self._ask(talk, command)).startswith("ERROR"):
-                self._log.warning("the receiver refuses a log", command=command.text, answer=answer)
+        fix = self._request_slow(talk, worth_asking(FIXES, of))
+        clock = self._request_slow(talk, [MessageId.TIME])
+        if self.pose is not MessageId.INSPVAX:
+            beside = [message for message in (fix, clock) if message is not None]
+            self._request_slow(talk, worth_asking(QUALITIES, of), self.pose, beside)
         self._await_pose(talk, self.pose, period_s)
         self._say_who(talk)
 
     def _heard(self, chunk: Chunk) -> bool:
         assert self._talk is not None
-        return any(frame.message_id == self.pose for frame in self._talk.take(chunk))
+        frames = self._talk.take(chunk)
+        if self._talk.greeted:
+            raise DeviceProtocolError(
+                f"{self.name} on {self.path}: the receiver has restarted",
+                "check its power; it is being set up again",
+            )
+        return any(frame.message_id == self.pose for frame in frames)
 
     def _leave(self, port: Port) -> None:
         if self._talk is not None:
@@ -174,10 +173,13 @@ class NovatelSpan(Device):
         self._check_line(POSES[0], self.baud)
         if found == self.baud:
             return talk
-        for command in (serial_config(int(com[1]), self.baud), com_config(int(com[1]), self.baud)):
+        commands = [serial_config(int(com[1]), self.baud), com_config(int(com[1]), self.baud)]
+        if generation(talk.version) in ("4", "V"):  # which know only the second
+            commands.reverse()
+        for command in commands:
             if talk.binary and command.binary is None:
                 continue
-            if self._ask(talk, command).startswith("ERROR"):  # the older generations know only the second
+            if self._ask(talk, command).startswith("ERROR"):
                 continue
             port.set_baud(self.baud)
             moved = _Talk(port, talk.binary, talk.port_name)
@@ -199,16 +201,8 @@ class NovatelSpan(Device):
 
     def _check_line(self, pose: MessageId, baud: int) -> None:
         """Raise DeviceError, with the arithmetic, where the logs do not fit the line."""
-        sizes = [FRAME_BYTES[message] for message in SLOW_LOGS]
-        bits_per_s = (FRAME_BYTES[pose] * self.rate_hz + sum(sizes)) * BITS_PER_BYTE
-        if bits_per_s > USABLE * baud:
-            slow = " + ".join(map(str, sizes))
-            raise DeviceError(
-                f"{self.name}: {pose.name}B at {self.rate_hz:g} Hz does not fit {baud} bit/s: "
-                f"({FRAME_BYTES[pose]} B x {self.rate_hz:g} + {slow} B) x {BITS_PER_BYTE} bits = "
-                f"{bits_per_s:.0f} bit/s, {bits_per_s / baud:.0%} of the line (at most {USABLE:.0%})",
-                "raise navigation.baud or lower navigation.rate_hz",
-            )
+        if reason := refusal(pose, self.rate_hz, baud, slow_logs(pose)):
+            raise DeviceError(f"{self.name}: {reason}", "raise navigation.baud or lower navigation.rate_hz")
 
     def _request_pose(self, talk: _Talk, port: Port, period_s: float) -> MessageId:
         refused = []
@@ -225,6 +219,30 @@ class NovatelSpan(Device):
             f"{self.name} on {port.path}: the receiver refuses every pose log ({'; '.join(refused)})",
             "its model must include SPAN (see VERSION), and have an IMU",
         )
+
+    def _request_slow(
+        self,
+        talk: _Talk,
+        messages: Sequence[MessageId],
+        pose: MessageId | None = None,
+        beside: Sequence[MessageId] = (),
+    ) -> MessageId | None:
+        """Ask for the first of some logs that is not refused, once a second; none of them is needed.
+
+        With ``pose``, only for what the line can carry beside that and the logs in ``beside``.
+        """
+        for message in messages:
+            command = log(message, Trigger.ONTIME, 1.0)
+            reason = ""
+            if pose is not None and talk.has_rate:
+                reason = refusal(pose, self.rate_hz, talk.port.baud, [*beside, message])
+            if not reason:
+                answer = self._ask(talk, command)
+                if not answer.startswith("ERROR"):
+                    return message
+                reason = answer
+            self._log.warning("a log is not sent", command=command.text, reason=reason)
+        return None
 
     def _ask(self, talk: _Talk, command: Command) -> str:
         answer = talk.ask(command, self.patience_s if talk.replies else self.answer_s)
@@ -268,6 +286,9 @@ class _Talk:
         self.version: Version | None = None
         self.config: InsConfig | None = None
         self.time_status: TimeStatus | int | None = None
+        self.greeted = False
+        """Whether the last prompt followed no reply: a receiver gives one by itself when it starts."""
+        self._last: Kind | None = None
         self._framer = Framer()
         self._answers: deque[str] = deque(maxlen=8)
 
@@ -317,6 +338,7 @@ class _Talk:
     def _note(self, frame: Frame) -> None:
         if frame.kind is Kind.PROMPT:
             self.port_name = frame.text
+            self.greeted = self._last is not Kind.REPLY
         elif frame.kind is Kind.REPLY:
             self.answered = self.replies = True
             self._answers.append(frame.text)
@@ -334,6 +356,7 @@ class _Talk:
                 self.answered, self.version = True, said
             elif isinstance(said, InsConfig):
                 self.config = said
+        self._last = frame.kind
 
 
 def _word(status: TimeStatus | int) -> str:

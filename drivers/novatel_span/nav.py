@@ -12,9 +12,18 @@ from polecal.drivers.novatel_span.enums import (
     MessageId,
     OffsetFrame,
     PositionType,
+    SolutionStatus,
 )
 from polecal.drivers.novatel_span.framer import Frame
-from polecal.drivers.novatel_span.logs import InsConfig, InsPva, InsPvax, parse
+from polecal.drivers.novatel_span.logs import (
+    BestPos,
+    InsConfig,
+    InsCov,
+    InsPva,
+    InsPvax,
+    InsStdev,
+    parse,
+)
 
 WEEK_NS = 604_800 * 10**9
 Triple = tuple[float, float, float]
@@ -60,6 +69,52 @@ class NavState:
     def good(self) -> bool:
         """Whether the receiver calls it INS_SOLUTION_GOOD; nothing else may be used."""
         return self.ins_status == InsStatus.INS_SOLUTION_GOOD
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """Standard deviations of the inertial solution: north, east, down; roll, pitch, azimuth.
+
+    The velocity's from INSCOV are along other axes than INSPVAX's, though of the same sum (a capture).
+    """
+
+    position_m: Triple
+    velocity_mps: Triple
+    attitude_deg: Triple
+
+
+def accuracy(said: object) -> Accuracy | None:
+    """Return the standard deviations that a parsed log tells: INSPVAX, INSSTDEV(S), INSCOV(S); else None.
+
+    What is no number there is infinitely uncertain.
+    """
+    values: tuple[float, ...]
+    match said:
+        case InsPvax() | InsStdev():
+            values = (
+                said.lat_sigma_m, said.lon_sigma_m, said.height_sigma_m,
+                said.vel_north_sigma_mps, said.vel_east_sigma_mps, said.vel_up_sigma_mps,
+                said.roll_sigma_deg, said.pitch_sigma_deg, said.azimuth_sigma_deg,
+            )  # fmt: skip
+        case InsCov():
+            pitch2, roll2, azimuth2 = said.attitude_cov_deg2[::4]
+            variances = (
+                *said.position_cov_m2[::4], *said.velocity_cov_m2ps2[::4], roll2, pitch2, azimuth2,
+            )  # fmt: skip
+            values = tuple(math.sqrt(value) if value >= 0 else math.inf for value in variances)
+        case _:
+            return None
+    n, e, d, vn, ve, vd, roll, pitch, azimuth = (
+        value if math.isfinite(value) else math.inf for value in values
+    )
+    return Accuracy((n, e, d), (vn, ve, vd), (roll, pitch, azimuth))
+
+
+def position_type(said: object) -> PositionType | int | None:
+    """Return what a parsed log says that the position rests on: INSPVAX, or BESTPOS and its like."""
+    if isinstance(said, BestPos) and said.solution_status != SolutionStatus.SOL_COMPUTED:
+        return PositionType.NONE
+    return said.position_type if isinstance(said, InsPvax | BestPos) else None
 
 
 def gps_ns(week: int, seconds_s: float) -> int:

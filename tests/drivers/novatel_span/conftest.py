@@ -79,12 +79,13 @@ class Peer:
         with self.changed:
             assert self.changed.wait_for(condition, timeout_s), self.commands
 
-    def reset(self):
-        """What a power cut does: no logs, factory rate."""
+    def reset(self, logs=(), baud=9600):
+        """What a power cut does: only saved logs, at the factory's or a saved rate, and a prompt."""
         with self.changed:
-            self.logs.clear()
-            self.baud = 9600
+            self.logs = dict(logs)
+            self.baud = baud
             self.commands.clear()
+            self._write(f"[{self.port}]".encode())
 
     def _run(self):
         while True:
@@ -150,7 +151,7 @@ class Peer:
         if number == 1:
             message, _, _, trigger = struct.unpack_from("<HBBI", body, 4)
             names = {37: "VERSIONB", 42: "BESTPOSB", 101: "TIMEB", 508: "INSPVASB", 1465: "INSPVAXB"}
-            names[1945] = "INSCONFIGB"
+            names |= {320: "INSCOVSB", 423: "BESTGPSPOSB", 1945: "INSCONFIGB"}
             period = f"ONTIME {struct.unpack_from('<d', body, 12)[0]:g}" if trigger == 2 else "ONCE"
             line = f"LOG {names[message]} {period}"
         else:
@@ -204,14 +205,19 @@ def make_peer(vectors):
         "INSPVAXB": "INSPVAXB driven",
         "BESTPOSB": "BESTPOSB INS_PPP",
         "TIMEB": "TIMEB OEM7",
+        "INSSTDEVSB": "INSSTDEVB",
+        "INSCOVSB": "INSCOVB",
+        "BESTGPSPOSB": "BESTPOSB INS_PPP",
         "VERSIONB": "VERSIONB (source bit=1)",
         "INSCONFIGB": "INSCONFIGB",
     }
     messages = {log: vectors[name]["wire"] for log, name in names.items()}
     peers = []
 
-    def make(**options):
-        peers.append(Peer(messages, **options))
+    def make(hardware="OEM628-1.00", **options):
+        head = messages["VERSIONB"][:-4].replace(b"OEMV3G-4.00-X2T", hardware.encode().ljust(15, b"\0"))
+        version = head + struct.pack("<I", zlib.crc32(head, 0xFFFFFFFF) ^ 0xFFFFFFFF)
+        peers.append(Peer(messages | {"VERSIONB": version}, **options))
         return peers[-1]
 
     yield make

@@ -47,15 +47,16 @@ def test_a_receiver_at_another_rate_is_found_and_brought_to_ours(make_peer):
     assert peer.baud == 115200
     assert peer.noise_heard > 0  # the other rates were tried first
     assert device.pose == MessageId.INSPVAS
-    assert peer.logs == {"INSPVASB": 0.02, "BESTPOSB": 1.0, "TIMEB": 1.0}
+    assert peer.logs == {"INSPVASB": 0.02, "BESTPOSB": 1.0, "TIMEB": 1.0, "INSPVAXB": 1.0}
     assert device.results == {
         "SERIALCONFIG COM1 115200 N 8 1 N OFF": "OK",
         "LOG INSCONFIGB ONCE": "OK",
         "LOG INSPVASB ONTIME 0.02": "OK",
         "LOG BESTPOSB ONTIME 1": "OK",
         "LOG TIMEB ONTIME 1": "OK",
+        "LOG INSPVAXB ONTIME 1": "OK",
     }
-    assert device.identity == "NovAtel OEMV3G-4.00-X2T, model L12LRVA, firmware 3.301"
+    assert device.identity == "NovAtel OEM628-1.00, model L12LRVA, firmware 3.301"
     assert device.reference_point == "the IMU's centre of navigation"
 
 
@@ -89,11 +90,41 @@ def test_a_receiver_without_any_pose_log_is_an_error_with_its_own_words(make_pee
 
 
 def test_a_refused_slow_log_does_not_stop_the_poses(make_peer):
-    peer = make_peer(refuse=["BESTPOSB"])
+    peer = make_peer(refuse=["BESTPOSB", "TIMEB", "INSPVAXB", "INSCOVSB"])
     device = span(peer)
     set_up(device)
     assert device.results["LOG BESTPOSB ONTIME 1"].startswith("ERROR")
-    assert set(peer.logs) == {"INSPVASB", "TIMEB"}
+    assert set(peer.logs) == {"INSPVASB"}
+
+
+@pytest.mark.parametrize(
+    ("hardware", "refuse", "asked"),
+    [
+        ("OEM719N-1.00", [], {"BESTPOSB", "INSPVAXB"}),
+        ("OEM719N-1.00", ["INSPVAXB"], {"BESTPOSB", "INSSTDEVSB"}),
+        ("OEM719N-1.00", ["INSPVAXB", "INSSTDEVSB"], {"BESTPOSB", "INSCOVSB"}),
+        ("OEM628-1.00", ["INSPVAXB"], {"BESTPOSB", "INSCOVSB"}),
+        ("OEMV3G-4.00-X2T", [], {"BESTPOSB", "INSCOVSB"}),
+        ("OEM4g2-3.03-X2T", ["BESTPOSB"], {"BESTGPSPOSB", "INSCOVSB"}),
+        ("SPAN-NG", ["BESTPOSB", "INSPVAXB"], {"BESTGPSPOSB", "INSSTDEVSB"}),
+    ],
+)
+def test_logs_are_asked_for_by_what_the_receiver_has_and_the_next_best_where_refused(
+    make_peer, hardware, refuse, asked
+):
+    peer = make_peer(hardware, refuse=refuse)
+    device = span(peer)
+    set_up(device)
+    assert peer.logs.keys() - {"INSPVASB", "TIMEB"} == asked
+    lacking = {"OEM4": "INSPVAXB", "OEMV": "INSPVAXB", "OEM6": "INSSTDEVSB"}.get(hardware[:4], "BESTGNSSPOS")
+    assert not any(lacking in command for command in peer.commands)
+
+
+def test_standard_deviations_that_the_line_cannot_carry_are_gone_without(make_peer):
+    """INSCOVSB is longer than the INSPVAXB that the arithmetic counts with; 95 % of 9600 is 9120 bit/s."""
+    peer = make_peer("OEM628-1.00", baud=9600, refuse=["INSPVAXB"])
+    set_up(span(peer, baud=9600, rate_hz=5.0))
+    assert set(peer.logs) == {"INSPVASB", "BESTPOSB", "TIMEB"}
 
 
 def test_a_receiver_that_does_not_tell_its_setup_is_used_all_the_same(make_peer):
@@ -104,7 +135,14 @@ def test_a_receiver_that_does_not_tell_its_setup_is_used_all_the_same(make_peer)
 
 
 def test_an_old_receiver_takes_its_rate_by_com(make_peer):
-    peer = make_peer(baud=9600, refuse=["SERIALCONFIG"])
+    peer = make_peer("OEMV3G-4.00-X2T", baud=9600, refuse=["SERIALCONFIG"])
+    assert set_up(span(peer)) == 115200
+    assert "COM COM1,115200,N,8,1,N,OFF,ON" in peer.commands
+    assert not any(command.startswith("SERIALCONFIG") for command in peer.commands)
+
+
+def test_a_receiver_of_unknown_make_is_told_its_rate_in_either_way(make_peer):
+    peer = make_peer("SPAN-NG", baud=9600, refuse=["SERIALCONFIG"])
     assert set_up(span(peer)) == 115200
     assert "COM COM1,115200,N,8,1,N,OFF,ON" in peer.commands
 
@@ -151,7 +189,7 @@ def test_replies_between_the_logs_of_an_earlier_run_are_heard(make_peer):
     peer = make_peer(logs={"INSPVAXB": 0.01, "BESTPOSB": 0.05})
     device = span(peer)
     set_up(device)
-    assert set(peer.logs) == {"INSPVASB", "BESTPOSB", "TIMEB"}
+    assert peer.logs == {"INSPVASB": 0.02, "BESTPOSB": 1.0, "TIMEB": 1.0, "INSPVAXB": 1.0}
     assert set(device.results.values()) == {"OK"}
 
 
@@ -176,7 +214,7 @@ def test_more_than_the_line_carries_is_refused_with_the_arithmetic(make_peer):
     peer = make_peer()
     with pytest.raises(
         DeviceError,
-        match=r"\(104 B x 200 \+ 104 \+ 76 B\) x 10 bits = 209800 bit/s, 182% of the line",
+        match=r"\(104 B x 200 \+ 104 \+ 76 \+ 158 B\) x 10 bits = 211380 bit/s, 183% of the line",
     ):
         set_up(span(peer, rate_hz=200.0))
     assert not any(command.startswith("LOG INS") for command in peer.commands)
@@ -226,6 +264,18 @@ def test_a_receiver_that_restarts_is_set_up_again(make_peer):
         peer.wait_for(lambda: "TIMEB" in peer.logs)
         assert peer.baud == 115200
     assert device.reconnects >= 1
+
+
+def test_a_receiver_that_restarts_with_saved_logs_is_set_up_again_though_poses_come(make_peer):
+    peer = make_peer()
+    device = span(peer)
+    with running(device):
+        peer.wait_for(lambda: "INSPVAXB" in peer.logs)
+        peer.wait_for(lambda: device.state == "streaming")
+        peer.reset(logs={"INSPVASB": 0.1}, baud=115200)
+        peer.wait_for(lambda: peer.logs.get("INSPVASB") == 0.02)
+        peer.wait_for(lambda: device.state == "streaming")
+    assert device.reconnects == 1
 
 
 def test_every_byte_of_the_conversation_is_tapped(make_peer):

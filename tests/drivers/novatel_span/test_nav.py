@@ -15,8 +15,11 @@ from polecal.drivers.novatel_span import (
     InsStatus,
     MessageId,
     PositionType,
+    SolutionStatus,
+    accuracy,
     nav_state,
     parse,
+    position_type,
     reference_point,
 )
 from polecal.drivers.novatel_span.enums import InsOffset, OffsetFrame, OffsetSource
@@ -173,6 +176,49 @@ def test_a_week_that_ends_goes_on_in_gps_time(vectors):
         return nav_state(frame).gps_ns
 
     assert at(2101, 0.0) - at(2100, 604799.99) == 10_000_000
+
+
+def test_standard_deviations_are_alike_whichever_log_tells_them(driven):
+    extended = {
+        (frame.week, frame.ms): accuracy(parse(frame))
+        for frame in driven
+        if frame.message_id == MessageId.INSPVAX
+    }
+    compared = 0
+    for frame in driven:
+        if frame.message_id == MessageId.INSCOV and (beside := extended.get((frame.week, frame.ms))):
+            told = accuracy(parse(frame))
+            assert told.position_m == pytest.approx(beside.position_m, rel=1e-4)
+            assert told.attitude_deg == pytest.approx(beside.attitude_deg, rel=1e-4)
+            assert np.linalg.norm(told.velocity_mps) == pytest.approx(
+                np.linalg.norm(beside.velocity_mps), rel=1e-3
+            )
+            compared += 1
+    assert compared > 100
+
+
+def test_every_log_with_standard_deviations_tells_them_and_no_other_does(vectors):
+    def told(name):
+        (frame,) = Framer().feed(vectors[name]["wire"], 0)
+        return accuracy(parse(frame))
+
+    assert told("INSSTDEVB").attitude_deg[2] > 1
+    assert told("INSPVAXB driven").position_m == pytest.approx((0.0470, 0.0362, 0.0728), abs=1e-4)
+    assert told("INSPVASB OEM6") is None
+    assert told("BESTPOSB INS_PPP") is None
+
+
+def test_a_variance_that_is_none_is_infinitely_uncertain(vectors):
+    (frame,) = Framer().feed(vectors["INSCOVB"]["wire"], 0)
+    cov = replace(parse(frame), position_cov_m2=(-1.0, *[0.0] * 7, math.nan))
+    assert accuracy(cov).position_m == (math.inf, 0.0, math.inf)
+
+
+def test_what_a_position_rests_on_is_none_where_there_is_no_solution(vectors):
+    (frame,) = Framer().feed(vectors["BESTPOSB INS_PPP"]["wire"], 0)
+    assert position_type(parse(frame)) is PositionType.INS_PPP
+    lost = replace(parse(frame), solution_status=SolutionStatus.INSUFFICIENT_OBS)
+    assert position_type(lost) is PositionType.NONE
 
 
 def test_the_point_that_poses_speak_of_is_named(vectors):
