@@ -244,20 +244,27 @@ def plot(done: Study, true: Mount, path: Path) -> None:
         list(TABLE_5), [1e3 * row[0] for row in TABLE_5.values()], "k^:", ms=5, lw=1, label="the paper's rig"
     )
     above.set(ylabel="√c on all data, mm", title="Fig. 7 in kind: cost against the returns it was found from")
-    above.legend(frameon=False)
+    above.legend(frameon=False, title="mean, least and most of the draws")
     by_size = done.draws["in stretches"]
+    sizes = list(by_size)
     vectors = np.array([[one.mount.vector for one in some] for some in by_size.values()])
-    off = np.abs(vectors - true.vector) * [*[1e3] * 3, *[180 / np.pi] * 3]
+    off = np.sqrt(((vectors - true.vector) ** 2).mean(axis=1)) * [*[1e3] * 3, *[180 / np.pi] * 3]
     for axes, columns, unit in ((metres, range(3), "mm"), (degrees, range(3, 6), "°")):
         for column, marker in zip(columns, "osD", strict=True):
-            rms = np.sqrt((off[:, :, column] ** 2).mean(axis=1))
-            name = f"{PARAMETERS[column]}{' (the pole is round: Eq. 7 puts it into x)' * (column == 0)}"
-            axes.plot(list(by_size), rms, f"{marker}-", ms=4, label=name)
-        axes.set(yscale="log", ylabel=f"off the truth (rms), {unit}")
-        axes.legend(frameon=False, ncols=3, loc="upper right")
-    degrees.set(
-        xscale="log", xlabel="returns, drawn from every 30° slice of platform yaw (below: in stretches)"
+            (line,) = axes.plot(sizes, off[:, column], f"{marker}-", ms=4)
+            axes.annotate(
+                PARAMETERS[column],
+                (sizes[-1], off[-1, column]),
+                (8, 0),
+                textcoords="offset points",
+                va="center",
+                color=line.get_color(),
+            )
+        axes.set(yscale="log", ylabel=f"off the truth, {unit}")
+    metres.set_title(
+        "The mounts found in stretches (rms): Eq. 7 puts the pole's radius into x", fontsize="medium"
     )
+    degrees.set(xscale="log", xlabel="N, returns drawn from every 30° slice of platform yaw")
     for axes in (above, metres, degrees):
         axes.grid(which="major", color="0.9")
         axes.spines[["top", "right"]].set_visible(False)
