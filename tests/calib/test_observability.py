@@ -6,6 +6,7 @@ import pytest
 
 from polecal.calib import PARAMETERS, Kind, Mount, Returns, points_nav, solve
 from polecal.calib import moments as m
+from polecal.calib.blas import one_thread
 from polecal.calib.observability import can_be_found, information, sensitivity, weak_directions
 from polecal.calib.report.rig import Rig, drive
 
@@ -33,6 +34,7 @@ def found(returns, mount):
     return dict(zip(PARAMETERS, can_be_found(information(returns, mount)), strict=True))
 
 
+@one_thread
 def from_moments(returns, mount, unknowns, *, cost_m=0.03):
     """Inverse covariance of the first so many unknowns, were all returns independent."""
     pole = returns.kind == Kind.POLE
