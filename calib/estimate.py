@@ -25,6 +25,9 @@ MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
 
 _LAST_PASSES = 3  # the rate of improvement is what these brought
 _FEWEST_POLE_RETURNS = 10
+_FEWEST_TO_DISAGREE = 6
+_MOST_SET_ASIDE = 0.25  # of all passes: where more disagree, it is not they that are wrong
+_ODD, _ODD_M = 6.0, 0.06  # times the passes' median, and at least so far
 _TELLING = (2e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
 """An extra known no better than this is not told: 1 cm at 5 m/s; 5 mm; 5 mm on a metre; 2 cm on ten."""
 
@@ -71,7 +74,8 @@ class Result:
     ``time_s`` is by how much later than its stamps say the laser measured.
     ``covariance`` is (6, 6) in m and rad, order `PARAMETERS`. Costs are √c of Eq. 7 in m, after pole
     returns were moved to the pole's axis. ``improvement`` is by how much of itself √c over all data fell
-    through the last passes, or None before there are enough.
+    through the last passes, or None before there are enough. ``set_aside`` has the passes that disagree with
+    the others and were not used, by id, and why; nothing else counts them.
     """
 
     mount: Mount
@@ -85,6 +89,7 @@ class Result:
     improvement: float | None
     slices: tuple[Slice, ...]
     passes: int
+    set_aside: dict[int, str]
     returns: dict[Kind, int]
     verdict: Verdict
 
@@ -167,98 +172,173 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
 
     Raises CalibrationError where there are fewer than 10 pole returns.
     """
-    poles, grounds = ([one.total(kind) for one in passes] for kind in (Kind.POLE, Kind.GROUND))
-    pole = Scatter(poles, shift_m=axis_shift_m(setup.pole_radius_m), ranged=True)
-    ground = Scatter(grounds)
-    returns = {Kind.POLE: int(pole.count.sum()), Kind.GROUND: int(ground.count.sum())}
-    if returns[Kind.POLE] < _FEWEST_POLE_RETURNS:
+    problem = _Problem(passes, setup)
+    pole_returns = int(problem.pole.count.sum())
+    if pole_returns < _FEWEST_POLE_RETURNS:
         raise CalibrationError(
-            f"{returns[Kind.POLE]} pole returns are too few to calibrate from",
+            f"{pole_returns} pole returns are too few to calibrate from",
             "drive past the pole; if that was done, check its tape and that the laser's reflectivity is on",
         )
-    every = np.ones(len(passes), dtype=bool)
-    ratios = (np.inf, np.inf)
-
-    def form(used: NDArray[np.bool_]) -> Form:
-        return Form(pole.form(used, ratios[0]), ground.form(used, ratios[1]))
-
-    paper = whole = form(every)  # Eq. 7
-    measured = np.concatenate([setup.measured.vector, np.zeros(len(EXTRAS))])
-    held = {*setup.hold, *EXTRAS} - setup.extras
-    if setup.pass_error and len(passes) >= FEWEST_PASSES:
-        rough = solve.minimise(whole, measured, held)
-        ratios = pole.ratio(pole_rows(rough)), ground.ratio(ground_rows(rough))
-        whole = form(every)
-    without = [form(every & (np.arange(len(passes)) != index)) for index in range(len(passes))]
-    measured_sigma = np.concatenate([setup.measured_sigma.vector, _TELLING])
-    # What the data know no better than the tape measure is not taken from them. On a flat pad z is nearly
-    # free (paper.md, later work 4) and more passes hardly help: it must meet its own bound, or is held.
-    believable = measured_sigma.copy()
-    believable[2] = min(believable[2], setup.criteria.max_sigma[2])
-    vector = measured
+    used = np.ones(len(passes), dtype=bool)
+    set_aside: dict[int, str] = {}
     while True:
-        search = solve.minimise_globally if everywhere else solve.minimise
-        vector = search(whole, np.where(_mask(held), measured, vector), held)
-        free = ~_mask(held)
-        _, told = whole.slope(vector)
-        squared = whole.cost(vector)
-        if len(passes) < FEWEST_PASSES:
-            covariance = from_model(told, squared, len(passes), free)
-        else:
-            covariance = jackknife(np.stack([solve.minimise(part, vector, held) for part in without]))
-        # A scatter cannot see what no pass tells at all; what all returns, were they independent, could
-        # tell at best can. Where the minimum is may hide it: off level the cosine of a level sensor's pitch
-        # stretches the ranges, and noise puts it there. So the measured mount must be told from, too.
-        at_best = [
-            np.diag(from_model(whole.slope(at)[1], squared, returns[Kind.POLE], free))
-            for at in (vector, measured)
-        ]
-        doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*at_best))) / believable
-        worst = int(np.argmax(doubt))
-        if doubt[worst] <= 1.0:
+        found = problem.solve(used, everywhere=everywhere)
+        odd = problem.oddest(used, found.vector)
+        if odd is None or len(set_aside) >= _MOST_SET_ASIDE * len(passes):
             break
-        held.add(UNKNOWNS[worst])
-    mask = _mask(held)[:6]
-    spread = np.sqrt(np.diag(covariance))
-    told_extras = [
-        (index, name) for index, name in enumerate(UNKNOWNS) if name in EXTRAS and name not in held
-    ]
-    covariance = covariance[:6, :6]
-    covariance[mask, mask] = measured_sigma[:6][mask] ** 2
-    sigma = np.sqrt(np.diag(covariance))
-    cost_m = solve.cost_m(paper, vector)
-    improvement = None
-    if len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
-        before = solve.minimise(form(np.arange(len(passes)) < len(passes) - _LAST_PASSES), vector, held)
-        improvement = solve.cost_m(paper, before) / cost_m - 1.0 if cost_m else 0.0
-    slices = coverage([one.pole_returns for one in passes], setup.need)
-    verdict = judge(
-        criteria=setup.criteria,
-        need=setup.need,
-        slices=slices,
-        passes=len(passes),
-        cost_m=cost_m,
-        improvement=improvement,
-        sigma=sigma,
-        held=tuple(held),
-        shift=(vector - measured)[:6],
-        measured_sigma=measured_sigma[:6],
-    )
-    return Result(
-        mount=Mount.from_vector(vector[:6]),
-        extras={name: float(vector[index]) for index, name in told_extras},
-        extra_sigma={name: float(spread[index]) for index, name in told_extras},
-        cost_m=cost_m,
-        measured_cost_m=solve.cost_m(paper, measured),
-        sigma=Mount.from_vector(sigma),
-        covariance=covariance,
-        held=tuple(name for name in PARAMETERS if name in held),
-        improvement=improvement,
-        slices=slices,
-        passes=len(passes),
-        returns=returns,
-        verdict=verdict,
-    )
+        set_aside[passes[odd[0]].id] = odd[1]
+        used[odd[0]] = False
+    return problem.result(used, found, set_aside)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A minimum: the unknowns (12,), their covariance (12, 12), and which were held."""
+
+    vector: Array
+    covariance: Array
+    held: frozenset[str]
+    ratios: tuple[float, float]
+
+
+class _Problem:
+    """The passes of one laser, ready to be solved without some of them."""
+
+    def __init__(self, passes: Sequence[Pass], setup: Setup) -> None:
+        self.pole = Scatter(
+            [one.total(Kind.POLE) for one in passes], shift_m=axis_shift_m(setup.pole_radius_m), ranged=True
+        )
+        self.ground = Scatter([one.total(Kind.GROUND) for one in passes])
+        self._passes, self._setup = passes, setup
+        self._measured = np.concatenate([setup.measured.vector, np.zeros(len(EXTRAS))])
+        self._measured_sigma = np.concatenate([setup.measured_sigma.vector, _TELLING])
+
+    def solve(self, used: NDArray[np.bool_], *, everywhere: bool) -> _Found:
+        """Find the minimum over the used passes, with what they cannot tell held as measured."""
+        setup, measured = self._setup, self._measured
+        held = {*setup.hold, *EXTRAS} - setup.extras
+        numbers = np.flatnonzero(used)
+        enough = len(numbers) >= FEWEST_PASSES
+        ratios = (np.inf, np.inf)
+        if setup.pass_error and enough:
+            rough = solve.minimise(self._form(used, ratios), measured, held)
+            ratios = (
+                self.pole.ratio(pole_rows(rough), used),
+                self.ground.ratio(ground_rows(rough), used),
+            )
+        whole = self._form(used, ratios)
+        without = [self._form(_but(used, number), ratios) for number in numbers.tolist()] if enough else []
+        # What the data know no better than the tape measure is not taken from them. On a flat pad z is
+        # nearly free (paper.md, later work 4) and more passes hardly help: it meets its bound, or is held.
+        believable = self._measured_sigma.copy()
+        believable[2] = min(believable[2], setup.criteria.max_sigma[2])
+        search = solve.minimise_globally if everywhere else solve.minimise
+        vector = measured
+        while True:
+            vector = search(whole, np.where(_mask(held), measured, vector), held)
+            free = ~_mask(held)
+            squared = whole.cost(vector)
+            if enough:
+                covariance = jackknife(np.stack([solve.minimise(part, vector, held) for part in without]))
+            else:
+                covariance = from_model(whole.slope(vector)[1], squared, len(numbers), free)
+            # A scatter cannot see what no pass tells at all; what all returns, were they independent, could
+            # tell at best can. Where the minimum is may hide it: off level the cosine of a level sensor's
+            # pitch stretches the ranges, and noise puts it there. So it must be told at the measured mount,
+            # too.
+            count = int(self.pole.count[used].sum())
+            best = [
+                np.diag(from_model(whole.slope(at)[1], squared, count, free)) for at in (vector, measured)
+            ]
+            doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*best))) / believable
+            worst = int(np.argmax(doubt))
+            if doubt[worst] <= 1.0:
+                return _Found(vector, covariance, frozenset(held), ratios)
+            held.add(UNKNOWNS[worst])
+
+    def oddest(self, used: NDArray[np.bool_], vector: Array) -> tuple[int, str] | None:
+        """Find the used pass that disagrees most with the others, if any does beyond what they scatter."""
+        numbers = np.flatnonzero(used)
+        if len(numbers) < _FEWEST_TO_DISAGREE:
+            return None
+        worst: tuple[float, int, str] = (1.0, -1, "")
+        for scatter, rows, what in (
+            (self.pole, pole_rows(vector), "pole"),
+            (self.ground, ground_rows(vector), "ground"),
+        ):
+            seen = numbers[scatter.count[numbers] > 0]
+            if not len(seen):
+                continue
+            means = scatter.means(rows)[seen]
+            off_m = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+            spread_m = np.sqrt(scatter.within(rows)[seen])
+            for values, words in (
+                (off_m, f"its {what} is {{:.2f}} m off"),
+                (spread_m, f"its {what} is smeared by {{:.2f}} m"),
+            ):
+                odd = values / np.maximum(_ODD * np.median(values), _ODD_M)
+                index = int(np.argmax(odd))
+                worst = max(worst, (float(odd[index]), int(seen[index]), words.format(values[index])))
+        return None if worst[1] < 0 else worst[1:]
+
+    def result(self, used: NDArray[np.bool_], found: _Found, set_aside: dict[int, str]) -> Result:
+        """Say what was found, and judge it."""
+        setup, vector, held = self._setup, found.vector, found.held
+        paper = self._form(used, (np.inf, np.inf))  # Eq. 7
+        passes = [one for one, is_used in zip(self._passes, used, strict=True) if is_used]
+        mask = _mask(held)[:6]
+        covariance = found.covariance[:6, :6].copy()
+        covariance[mask, mask] = self._measured_sigma[:6][mask] ** 2
+        sigma = np.sqrt(np.diag(covariance))
+        spread = np.sqrt(np.diag(found.covariance))
+        told = [index for index, name in enumerate(UNKNOWNS) if name in EXTRAS and name not in held]
+        cost_m = solve.cost_m(paper, vector)
+        improvement = None
+        if len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
+            early = _but(used, *np.flatnonzero(used)[-_LAST_PASSES:].tolist())
+            before = solve.minimise(self._form(early, found.ratios), vector, held)
+            improvement = solve.cost_m(paper, before) / cost_m - 1.0 if cost_m else 0.0
+        slices = coverage([one.pole_returns for one in passes], setup.need)
+        verdict = judge(
+            criteria=setup.criteria,
+            need=setup.need,
+            slices=slices,
+            passes=len(passes),
+            cost_m=cost_m,
+            improvement=improvement,
+            sigma=sigma,
+            held=tuple(held),
+            shift=(vector - self._measured)[:6],
+            measured_sigma=self._measured_sigma[:6],
+        )
+        return Result(
+            mount=Mount.from_vector(vector[:6]),
+            extras={UNKNOWNS[index]: float(vector[index]) for index in told},
+            extra_sigma={UNKNOWNS[index]: float(spread[index]) for index in told},
+            cost_m=cost_m,
+            measured_cost_m=solve.cost_m(paper, self._measured),
+            sigma=Mount.from_vector(sigma),
+            covariance=covariance,
+            held=tuple(name for name in PARAMETERS if name in held),
+            improvement=improvement,
+            slices=slices,
+            passes=len(passes),
+            set_aside=set_aside,
+            returns={
+                Kind.POLE: int(self.pole.count[used].sum()),
+                Kind.GROUND: int(self.ground.count[used].sum()),
+            },
+            verdict=verdict,
+        )
+
+    def _form(self, used: NDArray[np.bool_], ratios: tuple[float, float]) -> Form:
+        return Form(self.pole.form(used, ratios[0]), self.ground.form(used, ratios[1]))
+
+
+def _but(used: NDArray[np.bool_], *numbers: int) -> NDArray[np.bool_]:
+    rest = used.copy()
+    rest[list(numbers)] = False
+    return rest
 
 
 def _mask(held: Collection[str]) -> NDArray[np.bool_]:

@@ -22,6 +22,10 @@ _MARGIN_BEAMS = 2  # next to a reflector a beam sees half of each
 _GROUND_BAND_M = 0.5
 _GROUND_RANGE_M = 30.0
 _MEMORY_SCANS = 200
+_TRIMS = 6
+_TRIM_SIGMAS = 3.5
+_EVEN_M = 0.03
+_FEWEST_GROUND = 50
 _MOST_PLACES = 32
 _WIDE_SHARE = 0.1
 
@@ -120,3 +124,24 @@ class Ground:
         self._levels_m.append(float(np.median(down_m[dull])))
         level_m = float(np.median(self._levels_m))
         return np.flatnonzero(dull & (np.abs(down_m - level_m) <= _GROUND_BAND_M))
+
+
+def even_ground(range_m: Array, bearing_rad: Array, down_m: Array) -> NDArray[np.bool_]:
+    """Say which of a pass's (N,) ground returns lie on even ground, not on people, grass or kerbs.
+
+    ``down_m`` is their z in n by a mount that may be off: then level ground looks like a plane over the
+    sensor's own x and y, whatever the heading. What stands out from that plane is left out.
+    """
+    plane = np.column_stack(
+        [np.ones(len(range_m)), range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)]
+    )
+    kept = np.ones(len(range_m), dtype=bool)
+    for _ in range(_TRIMS):
+        if np.count_nonzero(kept) < _FEWEST_GROUND:
+            break
+        flat = np.linalg.lstsq(plane[kept], down_m[kept], rcond=None)[0]
+        residual = down_m - plane @ flat
+        residual -= np.median(residual[kept])
+        spread_m = 1.4826 * float(np.median(np.abs(residual[kept])))
+        kept = np.abs(residual) <= max(_TRIM_SIGMAS * spread_m, _EVEN_M)
+    return kept

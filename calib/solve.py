@@ -72,9 +72,9 @@ class Scatter:
         within: Array = summed / np.maximum(1.0, self.count) / len(rows)
         return within
 
-    def ratio(self, rows: Array) -> float:
-        """Estimate `form`'s ratio from the passes themselves."""
-        there = self.count > 0
+    def ratio(self, rows: Array, used: NDArray[np.bool_]) -> float:
+        """Estimate `form`'s ratio from the used passes themselves."""
+        there = used & (self.count > 0)
         count = self.count[there]
         if len(count) < 2:
             return np.inf
@@ -118,14 +118,12 @@ def cost_m(form: Form, vector: Array) -> float:
 
 def pole_rows(vector: Array) -> Array:
     """Give what turns features into north and east of the pole, its lean taken off: (2, 108)."""
-    rows: Array = np.kron(_pole_weights(vector)[0], _h(vector))
-    return rows
+    return np.kron(_pole_weights(vector)[0], _h(vector)).astype(np.float64)
 
 
 def ground_rows(vector: Array) -> Array:
     """Give what turns features into down of the ground, its slope taken off: (1, 108)."""
-    rows: Array = np.kron(_ground_weights(vector)[0], _h(vector))
-    return rows
+    return np.kron(_ground_weights(vector)[0], _h(vector)).astype(np.float64)
 
 
 def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:

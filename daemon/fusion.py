@@ -37,6 +37,7 @@ STANDING = "vehicle standing"
 WAITED_TOO_LONG = "poses came too late"
 MALFORMED = "scan telegrams whose parts do not fit"
 OTHER_VARIANT = "scans of another angle or resolution"
+UNEVEN = "on the ground, but not of it"
 OTHER_REFLECTOR = "a reflector, but not the pole"
 
 
@@ -141,11 +142,16 @@ class LaserChannel:
                 break
             self._place(self._waiting.popleft(), stx_gps_ns - self._age_ns)
         oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns
-        return self._builder.close(oldest_ns)
+        return self._closed(oldest_ns)
 
     def end(self) -> list[StoredPass]:
         """Close what is open, at the end of a run."""
-        return self._builder.close()
+        return self._closed(None)
+
+    def _closed(self, t_ns: int | None) -> list[StoredPass]:
+        passes = self._builder.close(self.mount, t_ns)
+        self.dropped[UNEVEN] = self._builder.uneven
+        return passes
 
     def _place(self, scan: _Waiting, gps_ns: NDArray[np.int64]) -> None:
         poses = self._trajectory.at(gps_ns)

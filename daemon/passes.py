@@ -7,8 +7,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polecal.calib import Kind, Pass, Returns
+from polecal.calib import Kind, Mount, Pass, Returns, points_nav
 from polecal.calib.estimate import split
+from polecal.calib.segment import even_ground
 from polecal.daemon.trajectory import Poses
 
 _OUT_OF_VIEW_NS = 1_500_000_000
@@ -42,6 +43,8 @@ class PassBuilder:
 
     def __init__(self, slice_deg: int) -> None:
         self.too_short = 0
+        self.uneven = 0
+        """Ground returns left out, as they stood out of the ground."""
         self._slice_deg = slice_deg
         self._open: dict[int, _Open] = {}
         self._count = 0
@@ -58,8 +61,11 @@ class PassBuilder:
         current.last_ns = t_ns
         current.parts.append((gps_ns, returns))
 
-    def close(self, t_ns: int | None = None) -> list[StoredPass]:
-        """Give the passes that have ended by host time ``t_ns``; all that are open if None."""
+    def close(self, mount: Mount, t_ns: int | None = None) -> list[StoredPass]:
+        """Give the passes that have ended by host time ``t_ns``; all that are open if None.
+
+        ``mount`` is the best known, to tell even ground from what stands on it.
+        """
         ended = [
             place
             for place, one in self._open.items()
@@ -74,6 +80,9 @@ class PassBuilder:
                 self.too_short += 1
                 continue
             self._count += 1
+            kept = _even(returns, mount)
+            self.uneven += int(np.count_nonzero(~kept))
+            gps_ns, returns = gps_ns[kept], returns[kept]
             closed.append(
                 StoredPass(
                     id=self._count,
@@ -89,6 +98,14 @@ class PassBuilder:
     def counts(self) -> tuple[int, int]:
         """Give how many passes are open, and how many returns they hold."""
         return len(self._open), sum(len(part[1]) for one in self._open.values() for part in one.parts)
+
+
+def _even(returns: Returns, mount: Mount) -> NDArray[np.bool_]:
+    kept = np.ones(len(returns), dtype=bool)
+    ground = returns.kind == Kind.GROUND
+    part = returns[ground]
+    kept[ground] = even_ground(part.range_m, part.bearing_rad, points_nav(part, mount)[:, 2])
+    return kept
 
 
 def observed(

@@ -60,6 +60,7 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
             "cost_m": None,
             "measured_cost_m": None,
             "improvement": None,
+            "set_aside": [],
             "time_offset_s": 0.0,
             "extras": {},
             "verdict": {"accepted": False, "reasons": ["no pass of the pole yet"]},
@@ -75,6 +76,7 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
         "cost_m": result.cost_m,
         "measured_cost_m": result.measured_cost_m,
         "improvement": result.improvement,
+        "set_aside": [{"pass": number, "why": why} for number, why in result.set_aside.items()],
         "time_offset_s": result.extras.get("time_s", 0.0),
         "extras": {
             name: {"value": value, "sigma": result.extra_sigma[name]} for name, value in result.extras.items()

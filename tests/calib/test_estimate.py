@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from polecal.calib import CalibrationError, Criteria, Kind, Mount, Need, Returns, calibrate, cost
+from polecal.calib import CalibrationError, Criteria, Kind, Mount, Need, Returns, calibrate, cost, points_nav
 from polecal.calib.observations import PARAMETERS
 
 
@@ -181,3 +181,54 @@ def test_a_time_offset_is_told_from_x_by_passes_in_reverse(rig):
     assert result.extras["time_s"] == pytest.approx(0.02, abs=0.002)
     assert result.extra_sigma["time_s"] < 0.002
     assert result.mount.x_m == pytest.approx(rig.true.x_m, abs=0.01)
+
+
+def test_a_pass_that_disagrees_is_set_aside_and_named(rig):
+    good = rig.drive(noise_m=0.01, nav_m=0.01, seed=7)
+    jumped = good.position_m + np.where(good.pass_id == 5, 0.3, 0.0)[:, None] * [1.0, 0.5, 0.0]
+    result = calibrate(replace(good, position_m=jumped), rig.measured, pass_error=True)
+    assert list(result.set_aside) == [5]
+    assert "its pole is 0.3" in result.set_aside[5]
+    assert result.passes == 23
+    assert errors(result.mount, rig.true)[:2].max() < 0.01
+    assert calibrate(good, rig.measured, pass_error=True).set_aside == {}
+
+
+def test_passes_are_not_set_aside_where_half_of_them_disagree(rig):
+    good = rig.drive(noise_m=0.01, nav_m=0.01, seed=7)
+    halves = good.position_m + np.where(good.pass_id % 2, 0.3, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    result = calibrate(replace(good, position_m=halves), rig.measured, pass_error=True)
+    assert len(result.set_aside) <= 6
+    assert not result.verdict.accepted
+
+
+def with_extra(returns, rig, **extra):
+    """The same returns of a pole that leans, ground that slopes, or a reflector that shortens ranges."""
+    points = points_nav(returns, rig.true)
+    pole = (returns.kind == Kind.POLE)[:, None]
+    lean, slope, range_m = extra.get("lean", 0.0), extra.get("slope", 0.0), extra.get("range_m", 0.0)
+    shift = np.where(pole, [-lean, 0, 0] * points[:, 2:], [0, 0, -slope] * points[:, :1])
+    shifted = replace(returns, position_m=returns.position_m + shift)
+    return replace(shifted, range_m=returns.range_m - np.where(pole[:, 0], range_m, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "made", "sigma"),
+    [
+        ("lean_north", {"lean": 0.03}, 0.004),
+        ("slope_north", {"slope": 0.01}, 0.001),
+        ("range_m", {"range_m": 0.03}, 0.004),
+    ],
+)
+def test_what_else_shifts_the_cloud_is_found_and_leaves_the_mount_better(rig, name, made, sigma):
+    """Each extra on data that has it: found, the cost lower, and the mount no further from the truth."""
+    returns = with_extra(rig.drive(noise_m=0.01, nav_m=0.008, tilt_deg=3.0, seed=4), rig, **made)
+    (true,) = made.values()
+    with_it = calibrate(returns, rig.measured, pass_error=True, extras=[name])
+    without = calibrate(returns, rig.measured, pass_error=True)
+    assert with_it.extras[name] == pytest.approx(true, abs=3 * sigma)
+    assert with_it.cost_m < without.cost_m
+    bad = errors(without.mount, rig.true)
+    assert (errors(with_it.mount, rig.true) / [1, 1, 5, 57, 57, 57]).max() < max(
+        0.01, (bad / [1, 1, 5, 57, 57, 57]).max()
+    )

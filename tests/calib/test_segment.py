@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from polecal.calib.segment import Ground, Places, reflectors
+from polecal.calib.segment import Ground, Places, even_ground, reflectors
 
 BEARING = np.radians(50 - 0.25 * np.arange(401))
 
@@ -79,3 +79,19 @@ def test_ground_is_dull_near_its_level_and_not_beside_a_reflector():
 
 def test_a_scan_of_nothing_has_no_ground():
     assert not len(Ground().beams(np.full(9, np.nan), np.zeros(9), np.full(9, np.nan)))
+
+
+def test_people_and_tufts_are_left_out_of_the_ground_though_the_mount_is_off():
+    rng = np.random.default_rng(0)
+    bearing, range_m = rng.uniform(-0.8, 0.8, 3000), rng.uniform(5, 12, 3000)
+    off_by_two_degrees = 0.035 * range_m * np.cos(bearing) - 0.02 * range_m * np.sin(bearing)
+    down = 1.1 + off_by_two_degrees + 0.005 * rng.normal(size=3000)
+    standing = rng.random(3000) < 0.15
+    down[standing] -= rng.uniform(0.08, 0.45, np.count_nonzero(standing))
+    kept = even_ground(range_m, bearing, down)
+    assert np.count_nonzero(kept[standing]) < 0.02 * np.count_nonzero(standing)
+    assert np.count_nonzero(kept[~standing]) > 0.98 * np.count_nonzero(~standing)
+
+
+def test_too_few_ground_returns_are_all_kept():
+    assert even_ground(np.full(9, 5.0), np.zeros(9), np.arange(9.0)).all()

@@ -9,6 +9,7 @@ from polecal.daemon.passes import PassBuilder, joined, observed
 from polecal.daemon.trajectory import Poses
 
 SECOND = 1_000_000_000
+MOUNT = Mount(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def returns(pole, ground=0, at=0.0):
@@ -33,9 +34,9 @@ def builder():
 
 def test_a_pass_is_open_while_the_pole_is_in_view_and_closed_after_it(builder):
     seen(builder, 0, [1.0, 1.1, 1.2, 2.5])
-    assert builder.close(round(3.9 * SECOND)) == []
+    assert builder.close(MOUNT, round(3.9 * SECOND)) == []
     assert builder.counts() == (1, 60)
-    (one,) = builder.close(round(4.1 * SECOND))
+    (one,) = builder.close(MOUNT, round(4.1 * SECOND))
     assert builder.counts() == (0, 0)
     assert one.t_ns == (SECOND, round(2.5 * SECOND))
     assert len(one.returns) == len(one.gps_ns) == 60
@@ -45,33 +46,33 @@ def test_a_pass_is_open_while_the_pole_is_in_view_and_closed_after_it(builder):
 def test_nothing_is_closed_twice_and_numbers_go_on(builder):
     for start_s in (1.0, 20.0, 40.0):
         seen(builder, 0, [start_s, start_s + 0.5])
-        (one,) = builder.close(round((start_s + 10) * SECOND))
+        (one,) = builder.close(MOUNT, round((start_s + 10) * SECOND))
         assert (one.returns.pass_id == one.id).all()
         assert one.moments.id == one.id
-        assert builder.close() == []
+        assert builder.close(MOUNT) == []
     assert one.id == 3
 
 
 def test_places_have_passes_of_their_own(builder):
     seen(builder, 0, [1.0, 1.2, 1.4])
     seen(builder, 4, [1.3, 3.0])
-    (one,) = builder.close(round(3.1 * SECOND))
+    (one,) = builder.close(MOUNT, round(3.1 * SECOND))
     assert (one.place, one.t_ns[1]) == (0, round(1.4 * SECOND))
-    (other,) = builder.close()
+    (other,) = builder.close(MOUNT)
     assert (other.place, len(other.returns)) == (4, 30)
     assert other.id != one.id
 
 
 def test_the_end_of_a_run_closes_what_is_open(builder):
     seen(builder, 0, [1.0, 1.1, 1.2])
-    assert len(builder.close()) == 1
+    assert len(builder.close(MOUNT)) == 1
 
 
 def test_a_vehicle_that_never_turns_away_does_not_fill_the_memory(builder):
     most, closed = 0, 0
     for tenth in range(3000):
         seen(builder, 0, [tenth / 10])
-        closed += len(builder.close(tenth * SECOND // 10))
+        closed += len(builder.close(MOUNT, tenth * SECOND // 10))
         most = max(most, builder.counts()[1])
     assert closed == 4
     assert most <= 15 * 602
@@ -79,15 +80,15 @@ def test_a_vehicle_that_never_turns_away_does_not_fill_the_memory(builder):
 
 def test_a_glimpse_is_no_pass_and_is_counted(builder):
     seen(builder, 0, [1.0], pole=19)
-    assert builder.close() == []
+    assert builder.close(MOUNT) == []
     assert builder.too_short == 1
     seen(builder, 0, [9.0], pole=20)
-    assert [one.id for one in builder.close()] == [1]
+    assert [one.id for one in builder.close(MOUNT)] == [1]
 
 
 def test_a_closed_pass_has_the_moments_of_its_returns(builder):
     seen(builder, 0, [1.0, 1.1, 1.2])
-    (one,) = builder.close()
+    (one,) = builder.close(MOUNT)
     again = split(one.returns, 30)
     assert one.moments.blocks.keys() == again.keys()
     assert sum(block.count for block in one.moments.blocks.values()) == len(one.returns)
