@@ -32,9 +32,19 @@ _ONTIME_HZ = (1, 2, 4, 5, 10, 20, 50, 100, 200)
 """Rates of NovAtel's ONTIME trigger from 1 Hz up. SPAN sheet, 5."""
 
 _SPAN_BAUDS = (9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
-_INSPVAS_BYTES = 104
-_BESTPOS_AND_TIME_BYTES = 180  # both once a second
-_BITS_PER_BYTE = 10  # 8N1
+
+_POSITION_TYPES = (
+    *("INS_RTKFIXED", "INS_RTKFLOAT", "INS_PSRDIFF", "INS_PPP", "INS_PPP_CONVERGING", "INS_PPP_BASIC"),
+    *("INS_PPP_BASIC_CONVERGING", "INS_OMNISTAR", "INS_OMNISTAR_HP", "INS_OMNISTAR_XP", "RTK_DIRECT_INS"),
+    *("NARROW_INT", "WIDE_INT", "L1_INT", "NARROW_FLOAT", "IONOFREE_FLOAT", "L1_FLOAT", "PSRDIFF"),
+    *("PPP", "PPP_CONVERGING", "PPP_BASIC", "PPP_BASIC_CONVERGING"),
+    *("OMNISTAR", "OMNISTAR_HP", "OMNISTAR_XP"),
+)
+"""With corrections of some kind; without (INS_PSRSP, INS_SBAS, SINGLE, WAAS, NONE) a position wanders by more
+between two passes than the laser's whole offset. How good the corrections are, the sigmas tell."""
+
+_TIME_STATUS = ("FINE", "FINEBACKUPSTEERING", "FINESTEERING")
+"""The receiver's time may be mapped to the host's. SPAN sheet, 3.4."""
 
 
 class ConfigError(PolecalError):
@@ -152,21 +162,57 @@ class Laser(_Part):
         return reflectivity
 
 
+class NavigationSigma(_Part):
+    """The largest standard deviations, as the receiver tells them, at which its poses are used.
+
+    A recorded PPP drive stays under 0.06 m, 0.1 m, 0.035 m/s, 0.03° and 0.3°; code corrections alone (0.4 m)
+    are refused, as passes would differ by more than an accepted calibration may.
+    """
+
+    position_m: Positive = 0.2  # north and east, each
+    height_m: Positive = 0.3
+    velocity_mps: Positive = 0.1
+    roll_pitch_deg: Positive = 0.1
+    azimuth_deg: Positive = 0.5
+
+
 class Navigation(_Part):
-    """The SPAN receiver's line and pose rate."""
+    """The SPAN receiver's line and pose rate, and which of its poses are trusted.
+
+    ``position_types`` and ``time_status`` by NovAtel's names. ``max_off_course_deg`` is how far azimuth and
+    course over ground may differ on a straight, forward or in reverse; 90 never refuses.
+    """
 
     port: PortPath
     baud: Annotated[int, _one_of(*_SPAN_BAUDS)] = 230400
     rate_hz: Annotated[int, _one_of(*_ONTIME_HZ)] = 100
+    position_types: Annotated[tuple[str, ...], Field(strict=False)] = _POSITION_TYPES
+    time_status: Annotated[tuple[str, ...], Field(strict=False)] = _TIME_STATUS
+    max_sigma: NavigationSigma = NavigationSigma()
+    max_off_course_deg: Annotated[float, Field(gt=0, le=90)] = 10.0
 
     @field_validator("rate_hz")
     @classmethod
     def _fits_the_line(cls, rate_hz: int, info: ValidationInfo) -> int:
-        needed = (rate_hz * _INSPVAS_BYTES + _BESTPOS_AND_TIME_BYTES) * _BITS_PER_BYTE
-        baud = info.data.get("baud", needed)
-        if needed > baud:
-            raise _fault(f"{rate_hz} Hz needs {needed} bit/s, more than baud {baud}")
+        from polecal.drivers.novatel_span.requests import POSES, refusal, slow_logs  # noqa: PLC0415 - numpy
+
+        baud = info.data.get("baud")
+        if baud and (reason := refusal(POSES[0], rate_hz, baud, slow_logs(POSES[0]))):
+            raise _fault(reason)
         return rate_hz
+
+    @field_validator("position_types", "time_status")
+    @classmethod
+    def _are_the_receivers_words(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        from polecal.drivers.novatel_span import PositionType, TimeStatus  # noqa: PLC0415 - numpy
+
+        known = PositionType if info.field_name == "position_types" else TimeStatus
+        unknown = [name for name in names if name not in known.__members__]
+        if unknown or not names:
+            raise _fault(
+                f"{unknown[0]!r} is none of NovAtel's" if unknown else "names none: no pose would do"
+            )
+        return names
 
 
 class Pole(_Part):

@@ -5,7 +5,7 @@ What it gives depends on nothing but the configuration and the chunks, in their 
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -18,37 +18,15 @@ from polecal.calib.uncertainty import FEWEST_PASSES
 from polecal.daemon import results
 from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.fusion import LaserChannel
+from polecal.daemon.navigation import Navigation, name_of
 from polecal.daemon.passes import StoredPass
+from polecal.daemon.pulse import Pulse
 from polecal.daemon.routine import OnTransition, Routine, State
 from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
-from polecal.drivers.novatel_span import Framer, InsStatus, nav_state
-from polecal.drivers.port import BITS_PER_BYTE
 
 OnPass = Callable[[str, StoredPass], None]
 """Takes (laser's name, pass) of every pass that is closed."""
-
-_RECEIVER_DRIFT = 200e-6
-_LOST_NS = 2_000_000_000  # without a good pose for so long, it is back to aligning
-_RATE_OVER = 50  # frames
-
-
-class _Pulse:
-    """How often something comes."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._times_ns: deque[int] = deque(maxlen=_RATE_OVER)
-
-    def beat(self, t_ns: int) -> None:
-        self.count += 1
-        self._times_ns.append(t_ns)
-
-    @property
-    def rate_hz(self) -> float:
-        if len(self._times_ns) < 2 or self._times_ns[-1] == self._times_ns[0]:
-            return 0.0
-        return (len(self._times_ns) - 1) * 1e9 / (self._times_ns[-1] - self._times_ns[0])
 
 
 class _LaserRun:
@@ -56,7 +34,7 @@ class _LaserRun:
 
     def __init__(self, config: Config, laser: Laser, trajectory: Trajectory, gps_clock: Clock) -> None:
         self.name = laser.name
-        self.pulse = _Pulse()
+        self.pulse = Pulse()
         self.setup = results.setup_of(config, laser)
         self.channel = LaserChannel(laser, config, trajectory, gps_clock, self.pulse.beat)
         self.result: Result | None = None
@@ -117,15 +95,10 @@ class Pipeline:
         self._session, self._created = session, created
         self._on_pass = on_pass
         self._need = config.routine
-        self._byte_ns = BITS_PER_BYTE * 1e9 / config.navigation.baud
-        self._framer = Framer()
-        self._pulse = _Pulse()
-        self._clock = Clock(max_drift=_RECEIVER_DRIFT)
-        self._trajectory = Trajectory(1.0 / config.navigation.rate_hz)
-        self._ins_status: InsStatus | int | None = None
-        self._good_ns = 0
+        self._navigation = Navigation(config.navigation)
         self._lasers = {
-            laser.name: _LaserRun(config, laser, self._trajectory, self._clock) for laser in config.lasers
+            laser.name: _LaserRun(config, laser, self._navigation.trajectory, self._navigation.clock)
+            for laser in config.lasers
         }
 
     def begin(self, t_ns: int) -> None:
@@ -139,8 +112,9 @@ class Pipeline:
         """
         if not self.routine.running:
             return
+        self._navigation.tick(t_ns)
         if device == SPAN:
-            self._navigate(t_ns, data)
+            self._navigation.feed(t_ns, data)
         elif device in self._lasers:
             self._lasers[device].channel.feed(t_ns, data)
         else:
@@ -180,12 +154,7 @@ class Pipeline:
     def device(self, name: str) -> dict[str, Any]:
         """Give the part of a device's STATUS that follows from its data."""
         if name == SPAN:
-            return {
-                "rate_hz": round(self._pulse.rate_hz, 2),
-                "ins_status": _named(self._ins_status),
-                "frames": self._framer.frames,
-                "bad_frames": self._framer.bad_frames,
-            }
+            return self._navigation.device()
         laser = self._lasers[name]
         return {
             "rate_hz": round(laser.pulse.rate_hz, 2),
@@ -201,38 +170,23 @@ class Pipeline:
                 return None
             lasers.append(
                 results.calibration(laser.name, laser.setup, laser.result, self._session, self._created)
+                | {"reference_point": self._navigation.reference_point}
             )
         return {"state": str(self.routine.state), "lasers": lasers}
-
-    def _navigate(self, t_ns: int, data: bytes) -> None:
-        for frame in self._framer.feed(data, t_ns):
-            nav = nav_state(frame)
-            if nav is None:
-                continue
-            self._pulse.beat(frame.t_first_ns)
-            self._ins_status = nav.ins_status
-            if nav.ins_status is not InsStatus.INS_SOLUTION_GOOD:
-                continue
-            self._clock.update(nav.gps_ns, round(frame.t_first_ns - frame.lead_bytes * self._byte_ns))
-            self._good_ns = t_ns
-            self._trajectory.add(nav)
 
     def _advance(self, t_ns: int) -> None:
         state = self.routine.state
         if (
             state is State.CONNECTING
-            and self._pulse.count
+            and self._navigation.pulse.count
             and all(laser.pulse.count for laser in self._lasers.values())
         ):
             self.routine.to(State.ALIGNING, t_ns, "all devices stream")
-        elif state is State.ALIGNING and self._good_ns and self._clock.locked and not self._lost(t_ns):
+        elif state is State.ALIGNING and self._navigation.ready:
             self.routine.to(State.COLLECTING, t_ns, "the navigation solution is good")
-        elif state is State.COLLECTING and self._lost(t_ns):
-            why = f"no good navigation solution for 2 s ({_named(self._ins_status)})"
-            self.routine.to(State.ALIGNING, t_ns, why)
-
-    def _lost(self, t_ns: int) -> bool:
-        return t_ns - self._good_ns > _LOST_NS
+        elif state is State.COLLECTING and self._navigation.lost:
+            why = "; ".join(self._navigation.why_not) or f"{name_of(self._navigation.ins_status)}"
+            self.routine.to(State.ALIGNING, t_ns, f"no good navigation solution for 2 s: {why}")
 
     def _take(self, laser: _LaserRun, stored: StoredPass) -> None:
         if self._on_pass is not None:
@@ -278,13 +232,7 @@ class Pipeline:
                 return ""
 
     def _notes(self) -> list[str]:
-        notes = []
-        if self.routine.state is State.ALIGNING:
-            if self._ins_status is not InsStatus.INS_SOLUTION_GOOD:
-                meaning = getattr(self._ins_status, "meaning", "nothing is used before it is good")
-                notes.append(f"navigation says {_named(self._ins_status)}: {meaning}")
-            elif not self._clock.locked:
-                notes.append("the receiver's clock is being learnt")
+        notes = self._navigation.why_not + self._navigation.notes if self.routine.running else []
         notes += [
             f"{laser.name}: a time offset cannot be told from x yet: pass the pole in reverse, "
             "or at another speed"
@@ -294,9 +242,3 @@ class Pipeline:
             and "time_s" not in laser.result.extras
         ]
         return notes
-
-
-def _named(status: InsStatus | int | None) -> str | None:
-    if status is None or isinstance(status, InsStatus):
-        return None if status is None else status.name
-    return f"unknown ({status})"

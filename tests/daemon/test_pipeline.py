@@ -229,8 +229,8 @@ def test_poses_that_are_not_good_are_not_used(begun, settings, drive, t0_ns):
     assert played.state is State.ALIGNING
     assert "INS_ALIGNING" in played.transitions[-1][3]
     assert any("INS_ALIGNING" in note for note in played.pipeline.status()["notes"])
-    assert all(one.gps_ns.max() < played.pipeline._trajectory.last_ns for _, one in played.passes)
-    last_s = receiver.gps_ms(played.last_ns) / 1e3 - played.pipeline._trajectory.last_ns / 1e9
+    assert all(one.gps_ns.max() < played.pipeline._navigation.trajectory.last_ns for _, one in played.passes)
+    last_s = receiver.gps_ms(played.last_ns) / 1e3 - played.pipeline._navigation.trajectory.last_ns / 1e9
     assert last_s == pytest.approx(10.0, abs=0.2)
 
 
