@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import TypeVar
 
@@ -16,7 +17,7 @@ REPLY_S = 1.0  # up to 130 ms at 38400 bit/s, 300 ms at 9600
 MODE_S = 3.0
 EEPROM_S = 15.0
 _AFTER_NAK_S = 0.03
-_QUIET_S = 0.1  # the laser pauses for up to 14 ms within a telegram
+QUIET_S = 0.1  # the laser pauses for up to 14 ms within a telegram
 _LATE_S = 0.25  # a reply to a request that was sent twice may come twice
 _TRIES = 5
 _HEARD_BYTES = 512
@@ -40,6 +41,7 @@ class Conversation:
 
     def __init__(self, port: Port) -> None:
         self.port = port
+        self._unanswered: tuple[Telegram, int, float, float] | None = None
         self._begin()
 
     def _begin(self) -> None:
@@ -68,7 +70,9 @@ class Conversation:
         """
         for attempt in range(tries):
             self._send(request)
-            frame = self._await(request, reply.code, ack_s, within_s)
+            self._unanswered = request, reply.code, ack_s, within_s
+            frame = self._await(*self._unanswered)
+            self._unanswered = None
             if frame is not None:
                 if attempt:
                     self.pause(_LATE_S)
@@ -77,6 +81,16 @@ class Conversation:
             f"{self.port.path}: the laser does not answer {request.code:02X}h at {self.port.baud} bit/s",
             "check plugs and cable; if the line is good, switch the laser off and on",
         )
+
+    def finish(self) -> None:
+        """Wait for the answer to what had been asked when the stop came: it looks like the next one's.
+
+        A0 does not say which 20h it answers. Raises Stopped, DeviceLost.
+        """
+        if self._unanswered is not None:
+            with contextlib.suppress(NotAllowed):
+                self._await(*self._unanswered)
+            self._unanswered = None
 
     def pause(self, seconds: float) -> None:
         """Let time pass and the line run on. Raises Stopped, DeviceLost."""
@@ -93,10 +107,11 @@ class Conversation:
         end_s = time.monotonic() + ack_s
         acked = False
         while (left_s := end_s - time.monotonic()) > 0:
-            for frame in self._hear(min(left_s, _QUIET_S)):
+            for frame in self._hear(min(left_s, QUIET_S)):
                 if frame.command == code:
                     return frame
                 if frame.command == Refused.code:
+                    self._unanswered = None
                     raise NotAllowed(
                         f"{self.port.path}: the laser says that {request.code:02X}h is not allowed now (92)",
                         "it is in another mode, or of a type that lacks this: switch it off and on, "
@@ -116,7 +131,7 @@ class Conversation:
         chunk = self.port.read(timeout_s)
         self._quiet = chunk is None
         if chunk is None:
-            return self.framer.close() if timeout_s >= _QUIET_S else []
+            return self.framer.close() if timeout_s >= QUIET_S else []
         self.heard = (self.heard + chunk.data)[-_HEARD_BYTES:]
         return self.framer.feed(chunk.data, chunk.t_ns)
 

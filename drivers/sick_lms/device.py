@@ -22,6 +22,7 @@ from polecal.drivers.sick_lms.configuration import (
 from polecal.drivers.sick_lms.conversation import (
     EEPROM_S,
     MODE_S,
+    QUIET_S,
     Conversation,
     NoReply,
     NotAllowed,
@@ -55,6 +56,7 @@ _FOUND_WITHIN_S = 1.0
 _SETTLE_S = 0.25  # after a change of rate (sheet section 7)
 _WRITES = 3  # of one configuration, where the line swallows the answers
 _HEALTH_NS = 60_000_000_000
+_QUIET_NS = round(QUIET_S * 1e9)
 
 _LEVELS_MODE = 0x01  # measuring modes, sheet section 3.3
 _ENERGY_MODE = 0x0E
@@ -71,6 +73,7 @@ def refusal(
     resolution_deg: float,
     reflectivity: str,
     baud: int,
+    *,
     unit: str = "cm",
     max_range_m: float = 80.0,
 ) -> str:
@@ -84,9 +87,7 @@ def refusal(
     mode = _ENERGY_MODE if reflectivity == "energy" else _LEVELS_MODE
     largest_m = min(((1 << MEASURING_MODES[mode].range_bits) - 9) * _UNITS[unit], MAX_RANGE_M)
     if max_range_m > largest_m:
-        return (
-            f"in {unit} the laser's numbers end at {largest_m:.2f} m, not {max_range_m:g} m: use cm, or less"
-        )
+        return f"in {unit} the laser's numbers end at {largest_m:.2f} m, not {max_range_m:g} m: use cm"
     if reflectivity == "s14":
         fits = (fov_deg, resolution_deg) == (90, 0.5)
         return "" if fits else "an S14 laser sees 90° at 0.5° and nothing else"
@@ -141,7 +142,7 @@ class SickLms(Device):
         max_range_m: float = 80.0,
     ) -> None:
         super().__init__(name, path, baud, tap)
-        reason = refusal(fov_deg, resolution_deg, reflectivity, baud, unit, max_range_m)
+        reason = refusal(fov_deg, resolution_deg, reflectivity, baud, unit=unit, max_range_m=max_range_m)
         if not reason and resting_baud not in BAUD_MODES:
             reason = f"the laser cannot rest at {resting_baud} bit/s"
         if reason:
@@ -157,6 +158,7 @@ class SickLms(Device):
         self._talk: Conversation | None = None
         self._refused_data: set[bytes] = set()  # configurations that were written and did not hold
         self._health_due_ns = 0
+        self._heard_ns = 0
 
     def about(self) -> dict[str, object]:
         """Give its health, how its reflectivity comes, and how often its EEPROM was written."""
@@ -314,7 +316,11 @@ class SickLms(Device):
     def _heard(self, chunk: Chunk) -> bool:
         talk = self._talk
         assert talk is not None
-        frames = talk.framer.feed(chunk.data, chunk.t_ns)
+        # after a silence the rest of what was held will not come: what comes may be the power-on string
+        quiet = chunk.t_ns - self._heard_ns > _QUIET_NS
+        self._heard_ns = chunk.t_ns
+        frames = talk.framer.close() if quiet else []
+        frames += talk.framer.feed(chunk.data, chunk.t_ns)
         for frame in frames:
             if frame.command == PowerOn.code:
                 raise DeviceProtocolError(
@@ -366,6 +372,7 @@ class SickLms(Device):
         if self._talk is None:
             return
         talk = self._talk
+        talk.finish()
         for rate in dict.fromkeys((port.baud, self.baud)):  # a change of rate may have been under way
             with contextlib.suppress(NoReply):
                 if port.baud != rate:

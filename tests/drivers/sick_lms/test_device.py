@@ -1,13 +1,10 @@
-"""The conversation with a laser, against a scripted one on a pseudo-terminal."""
+"""The conversation with a laser, against a scripted one in virtual time."""
 
 import os
 import random
-import select
 import struct
-import termios
 import threading
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -21,9 +18,9 @@ CONFIGURATION = bytes.fromhex(  # a real LMS200's, in cm: the sheet's F4
 )
 RIGHT = CONFIGURATION[:4] + b"\x02\x01\x00" + CONFIGURATION[7:]
 RATES = {0x42: 9600, 0x41: 19200, 0x40: 38400, 0x48: 500000}
-SPEEDS = {getattr(termios, f"B{rate}"): rate for rate in RATES.values()}
 NOISE = bytes.fromhex("F8 02 80 28 03 B0 06 15 80 FE 00 02 00 02 7F E6")
 SILENT = object()
+SCAN_NS = 5_000_000
 
 
 class Laser:
@@ -44,57 +41,45 @@ class Laser:
         self.script: Callable[[bytes], object] = lambda body: None
         self.wire: Callable[[bytes], bytes] = bytes
         self.cut_off = False
+        self.one_byte_at_a_time = False
+        self.path = "/dev/virtual"
         self._status, self._scan = status, scan
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.path = os.ttyname(self._slave)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._live)
-
-    def __enter__(self) -> "Laser":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-        os.close(self._master)
-        os.close(self._slave)
+        self._framer = Framer()
+        self._said = b""
+        self._next_ns: int | None = None  # when a scan comes; not before it has been spoken to
+        self._host_baud = 0
 
     @property
     def streams(self) -> bool:
         return self.mode in (0x24, 0x2B, 0x50)
 
-    @property
-    def host_baud(self) -> int | None:
-        return SPEEDS.get(termios.tcgetattr(self._master)[5])
-
     def send(self, data: bytes) -> None:
-        os.write(self._master, self.wire(data) if self.host_baud == self.baud else NOISE[: len(data)])
+        self._said += self.wire(data) if self._host_baud == self.baud else NOISE[: len(data)]
 
-    def _live(self) -> None:
-        framer = Framer()
-        spoken = False
-        while not self._over.is_set():
-            if not select.select([self._master], [], [], 0.005)[0]:
-                if self.streams and spoken and not self._backed_up():
-                    self.send(self._scan)
-                continue
-            data = os.read(self._master, 4096)
-            spoken = True
-            if self.host_baud != self.baud:
-                if self.streams:
-                    self.send(NOISE)
-                continue
-            for frame in framer.feed(data, 0):
-                if self.streams:  # it stops in mid-telegram
-                    self.send(self._scan[:11])
-                    self.cut_off = True
-                self.answer(frame.body)
+    def next_ns(self) -> int | None:
+        return self._next_ns if self.streams else None
 
-    def _backed_up(self) -> bool:
-        """Whether the host has not read yet what was sent."""
-        return bool(select.select([self._slave], [], [], 0)[0])
+    def transmit(self, t_ns: int, host_baud: int) -> bytes:
+        self._host_baud = host_baud
+        if not self._said and self.streams and self._next_ns is not None and t_ns >= self._next_ns:
+            self.send(self._scan)
+            self._next_ns = t_ns + SCAN_NS
+        size = 1 if self.one_byte_at_a_time else len(self._said)
+        said, self._said = self._said[:size], self._said[size:]
+        return said
+
+    def receive(self, t_ns: int, data: bytes, host_baud: int) -> None:
+        self._host_baud = host_baud
+        self._next_ns = t_ns + SCAN_NS
+        if host_baud != self.baud:
+            if self.streams:
+                self.send(NOISE)
+            return
+        for frame in self._framer.feed(data, t_ns):
+            if self.streams:  # it stops in mid-telegram
+                self.send(self._scan[:11])
+                self.cut_off = True
+            self.answer(frame.body)
 
     def answer(self, body: bytes) -> None:
         self.asked.append(body)
@@ -145,11 +130,12 @@ class Laser:
 
 
 @pytest.fixture
-def laser(usable: dict[str, bytes]) -> Iterator[Laser]:
+def laser(usable: dict[str, bytes], connected: Callable[[Laser], None]) -> Laser:
     status = usable["B1h status reply (real) #1"][4:-3]
     scan = usable["B0h 401 values mm 100/0.25deg with indices (constructed)"]
-    with Laser(status, scan) as one:
-        yield one
+    one = Laser(status, scan)
+    connected(one)
+    return one
 
 
 def answer(begins: bytes, reply: bytes) -> Callable[[bytes], object]:
@@ -235,9 +221,7 @@ def test_a_lost_reply_to_a_change_of_rate_is_made_out_at_the_new_rate(laser):
     assert laser.subs().count(0x48) == 1
 
 
-def test_a_lost_reply_to_a_write_is_made_out_by_reading_and_not_written_again(laser, monkeypatch):
-    monkeypatch.setattr("polecal.drivers.sick_lms.device.EEPROM_S", 0.3)
-
+def test_a_lost_reply_to_a_write_is_made_out_by_reading_and_not_written_again(laser):
     def mute(body: bytes) -> object:
         if body[0] == 0x77:
             laser.writes += 1
@@ -342,50 +326,44 @@ def test_a_laser_that_starts_anew_in_mid_run_is_noticed(laser, usable):
 
 
 @pytest.mark.parametrize("harm", ["loss", "flips", "one byte at a time"])
-def test_it_streams_once_a_bad_line_is_good_again(laser, harm):
+def test_it_streams_once_a_bad_line_is_good_again(laser, clock, harm):
     """One byte in five lost, or bits flipped, in the first answers; no crash, no hang."""
     chance = random.Random(7)
 
     def wire(data: bytes) -> bytes:
-        if harm == "one byte at a time":
-            for i in range(len(data) - 1):
-                os.write(laser._master, data[i : i + 1])
-            return data[-1:]
-        if len(laser.asked) > 8:
+        if len(laser.asked) > 8 or harm == "one byte at a time":
             return data
         if harm == "loss":
             return bytes(byte for byte in data if chance.random() > 0.2)
         return bytes(byte ^ (1 << chance.randrange(8) if chance.random() < 0.05 else 0) for byte in data)
 
     laser.wire = wire
+    laser.one_byte_at_a_time = harm == "one byte at a time"
     laser.configuration = RIGHT
-    streaming, stop = threading.Event(), threading.Event()
     device = device_on(laser)
-    framer = Framer()
-
-    def tap(direction: str, t_ns: int, data: bytes) -> None:
-        if direction == "rx" and any(frame.command == 0xB0 for frame in framer.feed(data, t_ns)):
-            streaming.set()
-
-    device._tap = tap
-    thread = threading.Thread(target=device.run, args=(device.open(stop),))
-    thread.start()
-    came = streaming.wait(30)
-    stop.set()
-    thread.join(10)
-    assert came
+    assert run_until_it_streams(device, clock)
     assert laser.mode == 0x25
 
 
-def test_it_is_left_in_request_mode_at_the_resting_rate(laser):
+def run_until_it_streams(device: SickLms, clock, at_most_s: float = 30.0) -> bool:
+    """Run it and stop it with the first scan; say whether one came."""
+    stop = clock.stop()
+    framer, scans = Framer(), []
+
+    def tap(direction: str, t_ns: int, data: bytes) -> None:
+        if direction == "rx" and any(frame.command == 0xB0 for frame in framer.feed(data, t_ns)):
+            scans.append(t_ns)
+            stop.set()
+
+    device._tap = tap
+    clock.at(at_most_s, stop.set)
+    device.run(device.open(stop))
+    return bool(scans)
+
+
+def test_it_is_left_in_request_mode_at_the_resting_rate(laser, clock):
     device = device_on(laser)
-    streaming, stop = threading.Event(), threading.Event()
-    device._tap = lambda direction, t_ns, data: streaming.set() if len(data) > 600 else None
-    thread = threading.Thread(target=device.run, args=(device.open(stop),))
-    thread.start()
-    assert streaming.wait(10)
-    stop.set()
-    thread.join(10)
+    assert run_until_it_streams(device, clock)
     assert (device.state, device.problem) == ("closed", None)
     assert (laser.mode, laser.baud) == (0x25, 9600)
 
@@ -411,9 +389,7 @@ def test_a_stop_ends_the_search_at_once():
         (b"login: ", "text"),
     ],
 )
-def test_nothing_found_says_what_was_heard(laser, sound, said, monkeypatch):
-    monkeypatch.setattr("polecal.drivers.sick_lms.device._ROUNDS", 1)
-    monkeypatch.setattr("polecal.drivers.sick_lms.conversation.ACK_S", 0.05)
+def test_nothing_found_says_what_was_heard(laser, sound, said):
     laser.baud = 38400
     laser.script = lambda body: sound or SILENT
     device = device_on(laser)
