@@ -16,12 +16,12 @@ def rotation(rpy_rad: Array) -> Array:
     c, s = np.cos(rpy_rad), np.sin(rpy_rad)
     cr, cp, cy = c[..., 0], c[..., 1], c[..., 2]
     sr, sp, sy = s[..., 0], s[..., 1], s[..., 2]
-    rows = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
+    entries = (
+        *(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        *(-sp, cp * sr, cp * cr),
     )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrices(entries)
 
 
 def rotation_gradient(rpy_rad: Array) -> Array:
@@ -49,10 +49,17 @@ def skew(vector: Array) -> Array:
     """Give the matrix (..., 3, 3) that crosses with ``vector`` (..., 3) from the left."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     o = np.zeros_like(x)
-    rows = ((o, -z, y), (z, o, -x), (-y, x, o))
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrices((o, -z, y, z, o, -x, -y, x, o))
 
 
 def wrap(angle_rad: Array) -> Array:
     """Bring angles in rad into [-π, π)."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+
+
+def _matrices(entries: tuple[Array, ...]) -> Array:
+    """Put nine arrays (...) together to matrices (..., 3, 3), row by row."""
+    matrices = np.empty((*np.shape(entries[0]), 9))
+    for index, entry in enumerate(entries):
+        matrices[..., index] = entry
+    return matrices.reshape(*np.shape(entries[0]), 3, 3)

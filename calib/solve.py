@@ -7,15 +7,14 @@ laser and navigation, a range offset of the reflector, a pole that leans, ground
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from polecal.calib.geometry import Array, roll_pitch_yaw, rotation, rotation_gradient
+from polecal.calib.geometry import Array, roll_pitch_yaw, rotation, rotation_gradient, skew
 from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments
 from polecal.calib.observations import PARAMETERS
 
@@ -27,7 +26,8 @@ UNKNOWNS = (*PARAMETERS, *EXTRAS)
 _STEPS = 100
 _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
 _SAME = 1 - 1e-6
-_TURNS_RAD = (0.0, np.pi / 2, np.pi, -np.pi / 2)
+_NOTHING = 1e-15
+_DESCENTS = 40
 
 
 class Scatter:
@@ -93,10 +93,7 @@ class Form:
     def cost(self, vector: Array) -> float:
         """Give c in m² at ``vector`` (12,)."""
         pole, ground = pole_rows(vector), ground_rows(vector)
-        c = np.einsum("ki,ij,kj->", pole, self.pole, pole) + np.einsum(
-            "ki,ij,kj->", ground, self.ground, ground
-        )
-        return max(0.0, float(c))
+        return max(0.0, float((pole @ self.pole * pole).sum() + (ground @ self.ground * ground).sum()))
 
     def slope(self, vector: Array) -> tuple[Array, Array]:
         """Give half the gradient (12,) and half the Gauss-Newton Hessian (12, 12) of c."""
@@ -104,9 +101,9 @@ class Form:
         h, dh = _h(vector), _h_gradient(vector)
         for matrix, weights in ((self.pole, _pole_weights(vector)), (self.ground, _ground_weights(vector))):
             for weight, dweight in zip(*weights, strict=True):
-                jacobian = np.kron(weight[:, None], dh) + np.kron(dweight, h[:, None])
+                jacobian = (weight[:, None, None] * dh + dweight[:, None] * h[:, None]).reshape(3 * WIDTH, -1)
                 pulled = matrix @ jacobian
-                gradient += pulled.T @ np.kron(weight, h)
+                gradient += pulled.T @ np.outer(weight, h).ravel()
                 hessian += jacobian.T @ pulled
         return gradient, hessian
 
@@ -118,12 +115,12 @@ def cost_m(form: Form, vector: Array) -> float:
 
 def pole_rows(vector: Array) -> Array:
     """Give what turns features into north and east of the pole, its lean taken off: (2, 108)."""
-    return np.kron(_pole_weights(vector)[0], _h(vector)).astype(np.float64)
+    return (_pole_weights(vector)[0][:, :, None] * _h(vector)).reshape(2, 3 * WIDTH)
 
 
 def ground_rows(vector: Array) -> Array:
     """Give what turns features into down of the ground, its slope taken off: (1, 108)."""
-    return np.kron(_ground_weights(vector)[0], _h(vector)).astype(np.float64)
+    return (_ground_weights(vector)[0][:, :, None] * _h(vector)).reshape(1, 3 * WIDTH)
 
 
 def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:
@@ -142,6 +139,8 @@ def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:
         while damping < _GIVE_UP:
             step = np.zeros(len(UNKNOWNS))
             step[free] = -np.linalg.lstsq(_damped(hessian, damping), gradient, rcond=1e-15)[0]
+            if -gradient @ step[free] <= _NOTHING * cost:  # what the step promises
+                return vector
             lower = form.cost(vector + step)
             if lower < cost:
                 break
@@ -149,15 +148,12 @@ def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:
         else:
             return vector
         vector = vector + step
-        settled = np.abs(step).max() < 1e-11 and cost - lower <= 1e-14 * cost
         cost, damping = lower, max(damping * _EASED, 1e-12)
-        if settled:
-            break
     return vector
 
 
 def minimise_globally(form: Form, start: Array, held: Collection[str] = ()) -> Array:
-    """Give the lowest of the minima found from ``start`` and from it turned by right angles.
+    """Give the lowest minimum there is, as far as sixty rotations spread evenly from ``start`` lead to it.
 
     The cost has false minima (paper.md, later work 6). Only rotations need be tried: for each the best
     position follows at once, as the cost is a parabola in r_b. What is held is never turned. Of equal
@@ -166,23 +162,70 @@ def minimise_globally(form: Form, start: Array, held: Collection[str] = ()) -> A
     near = minimise(form, start, held)
     if set(held) & {"roll", "pitch", "yaw"}:
         return near
-    ends = (minimise(form, turned, held) for turned in _turned(form, start, held))
-    lowest = min(ends, key=partial(cost_m, form))
+    lowest = minimise(form, _lowest_rotation(form, start, held), held)
     if cost_m(form, lowest) > _SAME * cost_m(form, near):
         return near
     lowest[3:6] = roll_pitch_yaw(rotation(lowest[3:6]))  # one of the two triples that mean the same rotation
     return lowest
 
 
-def _turned(form: Form, start: Array, held: Collection[str]) -> Iterator[Array]:
-    free = [axis for axis in range(3) if UNKNOWNS[axis] not in held]
-    for turn in list(product((0.0, np.pi), (0.0, np.pi / 2, -np.pi / 2), _TURNS_RAD))[1:]:
-        vector = start.copy()
-        vector[3:6] = roll_pitch_yaw(rotation(start[3:6]) @ rotation(np.array(turn)))
-        if free:
-            gradient, hessian = form.slope(vector)
-            vector[free] -= np.linalg.lstsq(hessian[np.ix_(free, free)], gradient[free], rcond=1e-9)[0]
-        yield vector
+def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
+    """Descend from many rotations at once, the extras as in ``start``; give the lowest end, (12,).
+
+    With the position eliminated c is a form in u = [first column of Csb, second, 1] alone, (7, 7): Newton's
+    way on SO(3), damped, R exp([δ]×), for all rotations in one array.
+    """
+    base = np.zeros((WIDTH, 10))  # h⁺ of h, at these extras
+    base[BASE] = np.eye(10)
+    base[RANGE, :6] = start[7] * np.eye(6)
+    base[TIME], base[TIME_SQUARED] = start[6] * np.eye(10), start[6] ** 2 * np.eye(10)
+    rows = [(form.pole, weight) for weight in _pole_weights(start)[0]]
+    rows += [(form.ground, weight) for weight in _ground_weights(start)[0]]
+    q = np.zeros((10, 10))
+    for matrix, weight in rows:
+        part = np.kron(weight[:, None], base)
+        q += part.T @ matrix @ part
+    free = [6 + axis for axis in range(3) if UNKNOWNS[axis] not in held]
+    known = np.zeros((10, 7))
+    known[:6, :6] = np.eye(6)
+    known[6:, 6] = [0.0 if 6 + axis in free else start[axis] for axis in range(3)] + [1.0]
+    to_position = -np.linalg.pinv(q[np.ix_(free, free)], rcond=1e-9, hermitian=True) @ q[free] @ known
+    whole = known.copy()
+    whole[free] += to_position
+    q7 = whole.T @ q @ whole
+    turns = rotation(start[3:6]) @ Rotation.create_group("I").as_matrix()
+    cost, damping = _cost7(q7, turns), np.full(len(turns), 1e-3)
+    for _ in range(_DESCENTS):
+        u = _u(turns)
+        jacobian = np.zeros((len(turns), 7, 3))  # of R exp([δ]×): d(R e) = -R [e]× δ
+        jacobian[:, :3], jacobian[:, 3:6] = -turns @ skew(np.eye(3)[0]), -turns @ skew(np.eye(3)[1])
+        pulled = q7 @ jacobian
+        gradient = np.einsum("bik,bi->bk", pulled, u)
+        hessian = np.einsum("bik,bil->bkl", jacobian, pulled)
+        scale = np.trace(hessian, axis1=1, axis2=2) + 1e-300
+        step = -np.linalg.solve(hessian + (damping * scale)[:, None, None] * np.eye(3), gradient[:, :, None])
+        turned = turns @ Rotation.from_rotvec(step[:, :, 0]).as_matrix()
+        lower = _cost7(q7, turned)
+        better = lower < cost
+        turns[better], cost = turned[better], np.minimum(cost, lower)
+        damping = np.clip(np.where(better, damping * _EASED, damping * _DAMPED), 1e-12, _GIVE_UP)
+    best = turns[int(np.argmin(cost))]
+    vector = start.copy()
+    vector[3:6] = roll_pitch_yaw(best)
+    vector[[index - 6 for index in free]] = to_position @ _u(best[None])[0]
+    return vector
+
+
+def _u(turns: Array) -> Array:
+    """Give [first column, second column, 1] of rotations (B, 3, 3): (B, 7)."""
+    columns = turns[:, :, :2].transpose(0, 2, 1).reshape(len(turns), 6)
+    return np.concatenate([columns, np.ones((len(turns), 1))], axis=1)
+
+
+def _cost7(q7: Array, turns: Array) -> Array:
+    u = _u(turns)
+    costs: Array = np.einsum("bi,ij,bj->b", u, q7, u)
+    return costs
 
 
 def _h(vector: Array) -> Array:
