@@ -217,9 +217,11 @@ def _ground(
     scan, beam = np.divmod(drawn, beams)
     bearing = np.radians(rig.half_fov_deg - rig.resolution_deg * beam)
     down = _along(columns[scan], bearing)[:, 2]
-    level = rig.rough_m * rng.normal(size=len(scan))
-    range_m = (level - origin[scan, 2]) / np.maximum(down, 1e-6)
-    hit = (range_m > 0) & (range_m < _FARTHEST_GROUND_M)
+    # how far is told by level ground: a bound on what is measured would keep the bumps and drop the hollows
+    per_m = 1 / np.maximum(down, 1e-6)
+    hit = (down > 0) & (-origin[scan, 2] * per_m < _FARTHEST_GROUND_M)
+    range_m = (rig.rough_m * rng.normal(size=len(scan)) - origin[scan, 2]) * per_m
+    hit &= range_m > 0
     return scan[hit], bearing[hit], range_m[hit]
 
 
