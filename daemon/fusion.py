@@ -150,7 +150,8 @@ class LaserChannel:
 
     def _closed(self, t_ns: int | None) -> list[StoredPass]:
         passes = self._builder.close(self.mount, t_ns)
-        self.dropped[UNEVEN] = self._builder.uneven
+        if passes:
+            self.dropped[UNEVEN] = self._builder.uneven
         return passes
 
     def _place(self, scan: _Waiting, gps_ns: NDArray[np.int64]) -> None:

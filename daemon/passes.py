@@ -66,6 +66,8 @@ class PassBuilder:
 
         ``mount`` is the best known, to tell even ground from what stands on it.
         """
+        if not self._open:
+            return []
         ended = [
             place
             for place, one in self._open.items()

@@ -119,11 +119,15 @@ class Pipeline:
             self._lasers[device].channel.feed(t_ns, data)
         else:
             return
+        before = self.routine.state
         self._advance(t_ns)
+        news = self.routine.state is not before
         for laser in self._lasers.values():
             for stored in laser.channel.fuse():
                 self._take(laser, stored)
-        self._conclude(t_ns)
+                news = True
+        if news:  # a verdict changes with a pass, and counts while collecting
+            self._conclude(t_ns)
 
     def finish(self, t_ns: int, why: str) -> None:
         """Calibrate with what there is, and end the run."""
