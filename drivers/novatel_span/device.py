@@ -298,9 +298,8 @@ class _Talk:
         return not self.port_name or re.fullmatch(r"COM\d+", self.port_name) is not None
 
     def start_line(self) -> None:
-        """End whatever half a line the receiver has heard."""
-        if not self.binary:
-            self.port.write(b"\r\n")
+        """End whatever half a line the receiver has heard, also before a binary command."""
+        self.port.write(b"\r\n")
 
     def send(self, command: Command) -> None:
         self.port.write(command.binary if self.binary and command.binary else command.ascii)
