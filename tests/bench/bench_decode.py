@@ -9,7 +9,8 @@ from polecal.drivers.emulated.virtual import Rig, play
 HEADINGS = ("what", "MB/s", "times the line's rate", "frames/s")
 
 LASER_LINE_BPS, SPAN_LINE_BPS = 50_000, 23_040
-REPEAT = 60
+REPEAT = 20
+RUNS = 3  # the best counts: others use the machine too
 
 
 def rows() -> Iterator[tuple[object, ...]]:
@@ -19,16 +20,9 @@ def rows() -> Iterator[tuple[object, ...]]:
     heard: dict[str, bytes] = dict.fromkeys(devices, b"")
     for name, _, data in play(devices, start_ns=0, seconds=20):
         heard[name] += data
-    yield _row(
-        "laser: frames", heard["laser"], LASER_LINE_BPS, lambda data: len(sick_lms.Framer().feed(data, 0))
-    )
+    yield _row("laser: frames", heard["laser"], LASER_LINE_BPS, _telegrams)
     yield _row("laser: frames, ranges, reflectivity", heard["laser"], LASER_LINE_BPS, _scans)
-    yield _row(
-        "receiver: frames",
-        heard["receiver"],
-        SPAN_LINE_BPS,
-        lambda data: len(novatel_span.Framer().feed(data, 0)),
-    )
+    yield _row("receiver: frames", heard["receiver"], SPAN_LINE_BPS, _logs)
     yield _row("receiver: frames, nav states", heard["receiver"], SPAN_LINE_BPS, _nav_states)
     yield _row("receiver: bulk columns of INSPVAS", heard["receiver"], SPAN_LINE_BPS, _columns)
 
@@ -56,7 +50,9 @@ def _columns(data: bytes) -> int:
 
 def _row(what: str, data: bytes, line_bps: int, work: Callable[[bytes], int]) -> tuple[object, ...]:
     data = data * REPEAT
-    began_s = time.perf_counter()
-    count = work(data)
-    took_s = time.perf_counter() - began_s
+    took_s = float("inf")
+    for _ in range(RUNS):
+        began_s = time.perf_counter()
+        count = work(data)
+        took_s = min(took_s, time.perf_counter() - began_s)
     return what, len(data) / took_s / 1e6, len(data) / took_s / line_bps, count / took_s

@@ -23,7 +23,7 @@ def set_variant(fov_deg, resolution_deg):
     return b"\x3b" + fov_deg.to_bytes(2, "little") + round(resolution_deg * 100).to_bytes(2, "little")
 
 
-def heard(world, kind, t0_ns, measuring_mode, variant, mode):
+def heard(world, kind, t0_ns, measuring_mode, variant, mode):  # noqa: PLR0917
     """What a host hears that has set its laser up by these telegrams."""
     laser = EmulatedLaser(world, t0_ns=t0_ns - 20 * SECOND, seed=1, type_string=f"LMS291;{kind};V02.10 ")
     span = EmulatedReceiver(world, t0_ns=t0_ns, seed=1)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from structlog.testing import capture_logs
 from polecal.drivers.emulated import laser_telegrams as lms
 from polecal.drivers.emulated.drive import SampledTrajectory
 from polecal.drivers.emulated.laser import EmulatedLaser, Health, Quirks
-from polecal.drivers.emulated.laser_telegrams import Mode, Variant
+from polecal.drivers.emulated.laser_telegrams import Mode
 from polecal.drivers.emulated.serve import serve
 from polecal.drivers.emulated.world import MountPose, World
 from polecal.drivers.sick_lms import SCAN_CODES, Frame, Framer, Scan, SickLms, bearings_rad
@@ -221,7 +221,7 @@ def test_reflectivity_tells_pole_from_ground_whichever_way_it_comes(  # noqa: PL
 
 
 def assert_pole_ahead(device: Watched, fov_deg: float, resolution_deg: float) -> None:
-    """Ground is dull, the pole is bright: by pass thresholds, on the one scale from 0 to 1."""
+    """Ground is dull, the pole is bright: by the thresholds of `calib`, on the one scale from 0 to 1."""
     count = round(fov_deg / resolution_deg) + 1
     bearing_deg = np.degrees(bearings_rad(count, fov_deg, resolution_deg))
     decoded = device.last.decode(device.measuring_mode)
@@ -407,12 +407,10 @@ def lossy(chance: random.Random) -> Callable[[bytes], bytes]:
 
 
 def flipping(chance: random.Random) -> Callable[[bytes], bytes]:
-    """One bit in 1000 is wrong: some five in a whole scan."""
-    return lambda data: bytes(byte ^ flips(chance) for byte in data)
-
-
-def flips(chance: random.Random) -> int:
-    return sum(1 << bit for bit in range(8) if chance.random() < 0.001)
+    """One byte in 125 has a wrong bit: some six in a whole scan."""
+    return lambda data: bytes(
+        byte ^ (1 << chance.randrange(8) if chance.random() < 0.008 else 0) for byte in data
+    )
 
 
 def cut(_: random.Random) -> Callable[[bytes], bytes]:
@@ -422,8 +420,8 @@ def cut(_: random.Random) -> Callable[[bytes], bytes]:
 GOOD_AGAIN_S = 3.0
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("bad_s", [0.7, 1.9, 4.0])
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("bad_s", [0.7, 4.0])
 @pytest.mark.parametrize("begins_s", [0.0, 8.0], ids=["from the start", "in mid-run"])
 @pytest.mark.parametrize("harm", [lossy, flipping, cut])
 def test_the_stream_is_back_within_3_s_of_the_wire_being_good(  # noqa: PLR0917
@@ -439,11 +437,69 @@ def test_the_stream_is_back_within_3_s_of_the_wire_being_good(  # noqa: PLR0917
         wire.bad_until_ns = good_ns
 
     clock.at(begins_s, spoil)
-    device = meet(wire, Watched(), scans=10**6, at_most_s=begins_s + bad_s + 6.0)
+    device = meet(wire, Watched(), scans=10**6, at_most_s=begins_s + bad_s + 4.5)
     back = [t_ns for t_ns, _ in device.scans if t_ns > good_ns]
     assert (back[0] - good_ns) * 1e-9 < GOOD_AGAIN_S
-    assert back[-1] > good_ns + 5.9 * SECOND  # and stays
+    assert back[-1] > good_ns + 4.4 * SECOND  # and stays
     let_through = {frame.data for _, frame in device.scans} - wire.true
-    print(f"{len(let_through)} wrong of {len(device.scans)} scans")
-    assert not let_through
+    assert not let_through  # the CRC is weak (test_framer.py): of few wrong bits it misses one case in 1000
     assert (laser.mode, laser.eeprom_writes) == (Mode.REQUEST, 0)
+
+
+@pytest.mark.parametrize("late_ms", [0, 30, 150])
+@pytest.mark.parametrize("bytes_at_a_time", [1, 7, 10**6])
+def test_however_late_and_in_what_pieces_bytes_come_all_scans_do(
+    clock, powered, meet, bytes_at_a_time, late_ms
+):
+    chance = random.Random(5)
+    wire = Wire(powered(eeprom=lms.STREAM_CONFIG))
+    wire.bytes_at_a_time = bytes_at_a_time
+    wire.late_ns = lambda: round(chance.uniform(0, late_ms) * 1e6)
+    device = meet(wire, Watched(), scans=20)
+    numbers = [Scan.parse(frame).telegram_index for _, frame in device.scans]
+    assert numbers == [(numbers[0] + k) % 256 for k in range(20)]
+    assert {frame.data for _, frame in device.scans} <= wire.true
+    assert (device.reconnects, device.problem) == (0, None)
+
+
+# --- in real time, on pseudo-terminals
+
+
+@pytest.mark.parametrize(
+    ("kind", "said", "options", "code"),
+    [
+        (S05, "just powered", {}, 0xB0),
+        (S05, "crashed in mid-stream", {}, 0xB0),
+        (S05, "crashed in mid-stream", {"resolution_deg": 1, "reflectivity": "energy"}, 0xF5),
+        (S14, "just powered", {"fov_deg": 90, "resolution_deg": 0.5, "reflectivity": "s14"}, 0xC4),
+    ],
+)
+def test_they_meet_on_a_pseudo_terminal(tmp_path, kind, said, options, code):
+    now_ns = time.monotonic_ns()
+    laser = EmulatedLaser(parked(), t0_ns=now_ns - SECOND, type_string=kind, boot_s=0.2)
+    if said != "just powered":
+        laser.force_stream(now_ns)
+    path = str(tmp_path / "lms")
+    over, ready, stop = threading.Event(), threading.Event(), threading.Event()
+    serving = threading.Thread(
+        target=serve, args=({path: laser},), kwargs={"stop": over, "ready": lambda _: ready.set()}
+    )
+    serving.start()
+    try:
+        assert ready.wait(5.0)
+        device = Watched(path=path, **options)
+        device.on_scan = lambda: stop.set() if len(device.scans) == 5 else None
+        running = threading.Thread(target=device.run, args=(device.open(stop),))
+        running.start()
+        running.join(30.0)
+        stop.set()
+        running.join(10.0)
+    finally:
+        over.set()
+        serving.join(5.0)
+    assert len(device.scans) >= 5
+    assert {frame.command for _, frame in device.scans} == {code}
+    assert_pole_ahead(device, device.fov_deg, device.resolution_deg)
+    assert (device.state, device.problem, device.reconnects) == ("closed", None, 0)
+    assert (laser.mode, laser.baud) == (Mode.REQUEST, 9600)
+    assert laser.eeprom_writes == device.about()["eeprom_writes"] <= 1
