@@ -28,6 +28,8 @@ from polecal.drivers.clock import Clock
 OnPass = Callable[[str, StoredPass], None]
 """Takes (laser's name, pass) of every pass that is closed."""
 
+_ABSURD_SIGMAS = 20.0  # off the hand measurement: of the default 0.1 m and 5 degrees, 2 m and 100 degrees
+
 
 class _LaserRun:
     """One laser: its channel, the passes it has given, and what they come to."""
@@ -58,13 +60,13 @@ class _LaserRun:
         except CalibrationError:
             return
         # One pass over level ground may put the laser anywhere; what is placed by that is lost.
-        self.channel.mount = self.result.mount if self._is_near(self.result.mount) else self.setup.measured
+        self.channel.mount = self.result.mount if self._could_be(self.result.mount) else self.setup.measured
 
-    def _is_near(self, mount: Mount) -> bool:
-        """Say whether a mount is near enough to the hand measurement to look for the pole with it."""
+    def _could_be(self, mount: Mount) -> bool:
+        """Say whether the hand measurement could be so wrong; if it is not absurd, let the data lead."""
         shift = mount.vector - self.setup.measured.vector
         shift[3:] = wrap(shift[3:])
-        most = self.setup.criteria.max_shift_sigmas * self.setup.measured_sigma.vector
+        most = _ABSURD_SIGMAS * self.setup.measured_sigma.vector
         return bool((np.abs(shift) <= most).all())
 
     def _progress(self, passes: Iterable[Pass]) -> int:
