@@ -21,7 +21,7 @@ from polecal.drivers.emulated.laser import EmulatedLaser, Health, Quirks
 from polecal.drivers.emulated.laser_telegrams import Mode
 from polecal.drivers.emulated.serve import serve
 from polecal.drivers.emulated.world import MountPose, World
-from polecal.drivers.sick_lms import SCAN_CODES, Frame, Framer, Scan, SickLms, bearings_rad
+from polecal.drivers.sick_lms import SCAN_CODES, Frame, Framer, Interlace, Scan, SickLms, bearings_rad
 
 RATES = (9600, 19200, 38400, 500000)
 BAUD_SUB = {rate: sub for sub, rate in lms.BAUD_OF_SUB.items()}
@@ -32,7 +32,7 @@ SECOND = 10**9
 
 
 def parked() -> World:
-    """A laser 1 m above the ground that looks 8° down, with a pole straight ahead."""
+    """A laser 1.1 m above the ground that looks 8° down, with a pole straight ahead."""
     still = SampledTrajectory([0.0, 1e6], np.tile([0, 0, -0.1], (2, 1)), np.zeros((2, 3)), np.zeros((2, 3)))
     return World(still, mount=MountPose(0, 0, -1.0, 0, -8.0, 0), pole_ne_m=(POLE_M, 0.0), range_noise_m=0.0)
 
@@ -254,6 +254,39 @@ def test_a_laser_without_energies_gives_levels_and_the_log_says_so(powered, meet
     (said,) = [entry for entry in log if "going on with levels" in entry["event"]]
     assert said["log_level"] == "warning"
     assert said["problem"]
+
+
+@pytest.mark.parametrize("flags_in_partials", [False, True])
+@pytest.mark.parametrize("unit", ["cm", "mm"])
+def test_interlaced_scans_join_to_one_of_180_degrees_without_levels(clock, powered, unit, flags_in_partials):
+    """Sheet, 3.3: they come in mode 0F, whatever is set; firmware that sets flags all the same shows none."""
+    settings = lms.STREAM_CONFIG[: lms.UNIT] + bytes([unit == "mm"]) + lms.STREAM_CONFIG[lms.UNIT + 1 :]
+    laser = powered(
+        at_rate(500000),
+        b"\x3b\x64\x00\x19\x00",
+        b"\x20\x2a",
+        eeprom=settings,
+        quirks=Quirks(no_echo=0.0, flags_in_partials=flags_in_partials),
+    )
+    clock.to(clock.ns + SECOND)
+    frames = Framer().feed(laser.transmit(clock.ns, 500000), clock.ns)
+    interlace = Interlace()
+    joined = [
+        whole for frame in frames if frame.command == 0xB0 and (whole := interlace.feed(Scan.parse(frame)))
+    ]
+    assert len(joined) == pytest.approx(75 / 4, abs=1.5)
+    assert interlace.lost <= 6  # at both ends
+    ranges_m = np.array([one.decode(0x01).ranges_m for one in joined])
+    assert np.isnan(joined[0].decode(0x01).reflectivity).all()
+    if not flags_in_partials:
+        bearing_deg = np.degrees(bearings_rad(721, 180, 0.25))
+        ground_m = (
+            1.0 / np.sin(np.radians(8)) / np.cos(np.radians(bearing_deg[[120, 600]]))
+        )  # beside the pole
+        assert ranges_m[:, 360] == pytest.approx((POLE_M - 0.04) / np.cos(np.radians(8)), abs=0.02)
+        assert ranges_m[:, [120, 600]] == pytest.approx(np.tile(ground_m, (len(joined), 1)), abs=0.02)
+    elif unit == "cm":
+        assert np.isnan(ranges_m[:, 360]).all()  # a level puts it beyond 80 m: no range, never a wrong one
 
 
 # --- the EEPROM
