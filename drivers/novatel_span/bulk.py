@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import itertools
 import zlib
 
 import numpy as np
@@ -19,6 +19,7 @@ from polecal.drivers.novatel_span.framer import (
 )
 
 _ONES = 0xFFFFFFFF  # zlib's CRC of a frame with its own NovAtel CRC behind it, from this start (sheet 1.4)
+_SYNC = b"\xaa\x44\x12\x13"  # the third byte tells a long header from a short one (sheet 1.1)
 _WEEK_MS = {True: (6, 8), False: (14, 16)}  # their offsets in a short and a long header (sheet 1.2, 1.3)
 
 
@@ -65,16 +66,19 @@ def _frames(
     data: bytes, message: MessageId, body_bytes: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
     """Return where frames of a log start, how long their headers are, and which are short ones."""
-    pattern = re.compile(rb"\xaa\x44[\x12\x13]." + re.escape(message.to_bytes(2, "little")), re.DOTALL)
-    starts = np.array([found.start() for found in pattern.finditer(data)], np.intp)
     raw = np.frombuffer(data, np.uint8)
-    starts = starts[starts <= len(raw) - SHORT_HEADER_BYTES - CRC_BYTES]
+    starts = np.flatnonzero(raw[: max(0, len(raw) - SHORT_HEADER_BYTES - CRC_BYTES + 1)] == _SYNC[0])
+    id_low, id_high = message.to_bytes(2, "little")
+    for at, allowed in ((1, _SYNC[1:2]), (4, (id_low,)), (5, (id_high,)), (2, _SYNC[2:])):
+        found = raw[starts + at]
+        starts = starts[np.logical_or.reduce([found == byte for byte in allowed])]
     short = raw[starts + 2] == 0x13
     length = np.where(short, raw[starts + 3], raw[starts + 8] + 256 * raw[starts + 9].astype(np.intp))
     headers = np.where(short, SHORT_HEADER_BYTES, raw[starts + 3]).astype(np.intp)
     ends = starts + headers + length + CRC_BYTES
     keep = (ends <= len(raw)) & (length >= body_bytes) & (ends - starts <= MAX_FRAME_BYTES)
     keep &= short | ((headers >= LONG_HEADER_BYTES) & (raw[starts + 6] & RESPONSE_BIT == 0))
-    spans = zip(starts[keep].tolist(), ends[keep].tolist(), strict=True)
-    keep[keep] = [zlib.crc32(data[start:end], _ONES) == _ONES for start, end in spans]
+    spans = map(slice, starts[keep].tolist(), ends[keep].tolist())
+    sums = map(zlib.crc32, map(data.__getitem__, spans), itertools.repeat(_ONES))
+    keep[keep] = np.fromiter(sums, np.uint32) == _ONES
     return starts[keep], headers[keep], short[keep]

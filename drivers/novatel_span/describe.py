@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Any
 
 from polecal.drivers.novatel_span.framer import Frame
-from polecal.drivers.novatel_span.logs import BestPos, InsPvax, Response, parse
+from polecal.drivers.novatel_span.logs import BestPos, InsPosx, InsPvax, Response, parse
 
 Plain = dict[str, Any]
 
@@ -37,7 +37,7 @@ class Describer:
         if isinstance(decoded, Response):
             plain["response"] = True
         plain |= _plain(decoded)
-        if isinstance(decoded, InsPvax | BestPos):
+        if isinstance(decoded, InsPvax | InsPosx | BestPos):
             plain["height_ellipsoidal_m"] = _plain(decoded.height_ellipsoidal_m)
         return plain
 

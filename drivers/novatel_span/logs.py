@@ -176,6 +176,28 @@ class InsPos(Log):
     ins_status: InsState
 
 
+@log(MessageId.INSPOSX)
+class InsPosx(Log):
+    """Position with standard deviations; its time is the header's."""
+
+    ins_status: InsState
+    position_type: Position
+    lat_deg: F64
+    lon_deg: F64
+    height_msl_m: F64
+    undulation_m: F32
+    lat_sigma_m: F32
+    lon_sigma_m: F32
+    height_sigma_m: F32
+    extended_status: X32
+    update_age_s: U16
+
+    @property
+    def height_ellipsoidal_m(self) -> float:
+        """Height above the WGS84 ellipsoid."""
+        return self.height_msl_m + self.undulation_m
+
+
 @log(MessageId.INSVEL, MessageId.INSVELS)
 class InsVel(Log):
     """Velocity."""
@@ -186,6 +208,22 @@ class InsVel(Log):
     vel_east_mps: F64
     vel_up_mps: F64
     ins_status: InsState
+
+
+@log(MessageId.INSVELX)
+class InsVelx(Log):
+    """Velocity with standard deviations; its time is the header's."""
+
+    ins_status: InsState
+    position_type: Position
+    vel_north_mps: F64
+    vel_east_mps: F64
+    vel_up_mps: F64
+    vel_north_sigma_mps: F32
+    vel_east_sigma_mps: F32
+    vel_up_sigma_mps: F32
+    extended_status: X32
+    update_age_s: U16
 
 
 @log(MessageId.INSSPD, MessageId.INSSPDS)

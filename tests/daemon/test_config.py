@@ -92,6 +92,11 @@ def test_all_faults_come_at_once_each_with_its_path():
         ("port: /dev/span", "port: /dev/span, rate_hz: 25", "navigation.rate_hz"),
         ("port: /dev/span", "port: /dev/span, baud: 57600", "navigation.rate_hz"),
         ("port: /dev/span", "port: /dev/span, baud: 500000", "navigation.baud"),
+        ("port: /dev/span", "port: /dev/span, position_types: [INS_RTK]", "navigation.position_types"),
+        ("port: /dev/span", "port: /dev/span, position_types: []", "navigation.position_types"),
+        ("port: /dev/span", "port: /dev/span, time_status: [GOOD]", "navigation.time_status"),
+        ("port: /dev/span", "port: /dev/span, max_sigma: {height_m: 0}", "navigation.max_sigma.height_m"),
+        ("port: /dev/span", "port: /dev/span, max_off_course_deg: 91", "navigation.max_off_course_deg"),
         ("pole:", "routine: {slice_deg: 50}\npole:", "routine.slice_deg"),
         ("pole:", "routine: {slice_deg: 45}\npole:", "routine.slices_needed"),
         ("pole:", "routine: {min_passes: 0}\npole:", "routine.min_passes"),
@@ -103,6 +108,20 @@ def test_all_faults_come_at_once_each_with_its_path():
 def test_what_cannot_be_is_refused_at_its_place(change, to, path):
     assert change in LEAST
     assert paths(LEAST.replace(change, to)) == [path]
+
+
+def test_a_rate_that_the_receivers_line_cannot_carry_is_refused_with_the_arithmetic():
+    (fault,) = faults(LEAST.replace("port: /dev/span", "port: /dev/span, baud: 115200, rate_hz: 200"))
+    assert "(104 B x 200 + 104 + 76 + 158 B) x 10 bits = 211380 bit/s, 183% of the line" in fault
+
+
+def test_which_poses_are_trusted_may_be_told():
+    told = (
+        "port: /dev/span, position_types: [INS_SBAS, NONE], time_status: [COARSE], max_sigma: {height_m: 9}"
+    )
+    loaded = config.loads(LEAST.replace("port: /dev/span", told)).navigation
+    assert (loaded.position_types, loaded.time_status) == (("INS_SBAS", "NONE"), ("COARSE",))
+    assert (loaded.max_sigma.height_m, loaded.max_sigma.position_m, loaded.max_off_course_deg) == (9, 0.2, 10)
 
 
 def test_a_second_laser_needs_its_own_name_and_port_whatever_else_is_wrong():

@@ -10,6 +10,7 @@ import pytest
 from polecal.daemon.config import Navigation as Settings
 from polecal.daemon.config import NavigationSigma
 from polecal.daemon.navigation import Navigation
+from polecal.daemon.routine import State
 from polecal.drivers.emulated.receiver import load_recording
 from polecal.drivers.novatel_span import Framer, InsStatus, MessageId, PositionType, TimeStatus, nav_state
 from polecal.drivers.novatel_span.framer import crc32
@@ -193,6 +194,16 @@ def test_copies_on_a_virtual_port_count_once(captures):
                 navigation.feed(t_ns, changed(frame.data, (7, "B", frame.port_address + 30)))
     states = [nav_state(frame) for _, data in stream for frame in Framer().feed(data, 0)]
     assert navigation.pulse.count == sum(state is not None for state in states) > 2000
+
+
+def test_a_run_with_a_sideways_imu_collects_nothing_and_status_says_why(begun, settings, streaming, drive):
+    """An emulated one at INS_SOLUTION_GOOD, 90° off, on the demonstration's drive."""
+    played = begun(settings()).feed(streaming(drive.world, 20.0, mounting_yaw_deg=90.0))
+    assert played.state is State.ALIGNING
+    status = played.pipeline.status()
+    assert played.pipeline.device("span")["ins_status"] == "INS_SOLUTION_GOOD"
+    assert any("azimuth is 90° off the course: the IMU's axes" in note for note in status["notes"])
+    assert not played.passes
 
 
 # --- what a pose is judged by

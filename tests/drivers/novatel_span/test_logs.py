@@ -22,7 +22,7 @@ from polecal.drivers.novatel_span import (
     parse,
 )
 from polecal.drivers.novatel_span.enums import NAMELESS, Component, TimeStatus
-from polecal.drivers.novatel_span.fields import LOGS
+from polecal.drivers.novatel_span.fields import LOGS, layout
 from polecal.drivers.novatel_span.framer import crc32
 from polecal.drivers.novatel_span.logs import InsConfig, RawImux, Response, RxStatus
 
@@ -161,6 +161,39 @@ def test_every_log_translated_by_the_maker_into_its_other_form_is_read_alike(vec
         assert all(map(near, ours, theirs)), (name, parse(frame), parse(twin))
         translated.add(frame.name)
     assert len(translated) > 20
+
+
+NUMBERED = sorted(
+    message.name
+    for message in MessageId
+    if message in LOGS and layout(LOGS[message]).fixed and hasattr(novatel_edie.oem.messages, message.name)
+)
+
+
+@pytest.mark.parametrize("name", NUMBERED)
+def test_every_log_encoded_by_the_maker_with_a_value_of_its_own_in_each_field_is_read_alike(name):
+    header = novatel_edie.oem.Header(week=2345, milliseconds=123_450.0)
+    message = getattr(novatel_edie.oem.messages, name)(header=header)
+    number = 0
+    for field, value in message.to_dict().items():
+        if type(value) in (int, float) and not field.startswith(("reserved", "rsvd")):
+            number += 1
+            setattr(message, field, type(value)(number))
+    binary, text = frame_of(bytes(message.to_binary().message)), frame_of(bytes(message.to_ascii().message))
+    assert binary.name == name
+    assert (binary.week, binary.ms) == (2345, 123_450)
+    for frame in (binary, text):
+        read = [value for value in leaves(parse(frame)) if value and not isinstance(value, str)]
+        assert [value for value in read if 0 < value <= number] == list(range(1, number + 1))
+
+
+def test_every_log_that_calibration_or_its_checks_may_want_has_a_class():
+    wanted = """INSPVA INSPVAS INSPVAX INSATT INSATTS INSATTX INSPOS INSPOSS INSPOSX INSVEL INSVELS INSVELX
+        INSCOV INSCOVS INSSTDEV INSSTDEVS BESTPOS BESTGPSPOS BESTVEL TIME TIMESYNC MARKTIME MARK2TIME RXSTATUS
+        VERSION INSCONFIG RAWIMU RAWIMUS RAWIMUX RAWIMUSX CORRIMUDATA CORRIMUDATAS VEHICLEBODYROTATION
+        HEADING2"""
+    assert all(MessageId[name] in LOGS for name in wanted.split())
+    assert len(NUMBERED) > 35
 
 
 def test_fields_carry_their_units(vectors):
