@@ -14,7 +14,6 @@ import numpy as np
 from polecal.calib import CalibrationError, Mount, Pass, Result, estimate
 from polecal.calib.coverage import headings
 from polecal.calib.geometry import wrap
-from polecal.calib.uncertainty import FEWEST_PASSES
 from polecal.daemon import results
 from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.fusion import LaserChannel
@@ -233,18 +232,29 @@ class Pipeline:
                     return f"drive past the pole from any side but heading {seen}"
                 if missing:
                     return f"drive past the pole heading {headings(sorted(missing), width)}"
-                return "drive more passes of the pole, from all sides"
+                return "drive more passes of the pole, from all sides" + self._to_know_more()
             case _:
                 return ""
 
+    def _to_know_more(self) -> str:
+        """Say what would make better known what is not known well enough, if that is all that is missing."""
+        for laser in self._lasers.values():
+            if laser.result is not None and any("known to" in why for why in laser.result.verdict.reasons):
+                return f"; {results.weakest(laser.setup, laser.result).drive}"
+        return ""
+
     def _notes(self) -> list[str]:
         notes = self._navigation.why_not + self._navigation.notes if self.routine.running else []
-        notes += [
-            f"{laser.name}: a time offset cannot be told from x yet: pass the pole in reverse, "
-            "or at another speed"
-            for laser in self._lasers.values()
-            if laser.result is not None
-            and laser.result.passes >= FEWEST_PASSES
-            and "time_s" not in laser.result.extras
-        ]
+        for laser in self._lasers.values():
+            result = laser.result
+            if result is None or not all(part.done for part in result.slices):
+                continue  # most of it will be told by the passes that are still missing
+            if set(result.held) - laser.setup.hold:
+                weak = results.weakest(laser.setup, result)
+                notes.append(f"{laser.name}: {weak.name} is held as measured; to free it: {weak.drive}")
+            if "time_s" not in result.extras:
+                notes.append(
+                    f"{laser.name}: a time offset cannot be told from x: pass the pole in reverse, "
+                    "or at another speed"
+                )
         return notes

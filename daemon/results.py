@@ -9,7 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polecal.calib import Criteria, Kind, Mount, Need, Result, Setup
+from polecal.calib.observability import Direction, weak_directions
 from polecal.daemon.config import Config, Laser
+
+_TOLD = 1e-3  # of the hand measurement's σ: nothing is known better, to say what is known worst
 
 FRAME = {
     "parent": "body, x forward, y right, z down; its origin is the point whose position the navigation gives",
@@ -83,6 +86,14 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
         },
         "verdict": {"accepted": result.verdict.accepted, "reasons": list(result.verdict.reasons)},
     }
+
+
+def weakest(setup: Setup, result: Result) -> Direction:
+    """Give the combination of unknowns that is known worst, in the hand measurement's σ: 1 is held."""
+    scale = setup.measured_sigma.vector
+    least = np.diag((_TOLD * scale) ** 2)  # the scatter of few passes is flat in some directions
+    information = np.asarray(np.linalg.inv(result.covariance + least), dtype=np.float64)
+    return weak_directions(information, scale)[0]
 
 
 def calibration(name: str, setup: Setup, result: Result, session: str, created: str) -> dict[str, Any]:
