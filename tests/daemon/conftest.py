@@ -125,7 +125,7 @@ def streaming() -> Callable[..., list[Chunk]]:
         seconds: float,
         *,
         laser: dict[str, Any] | None = None,
-        chunk_s: float = 0.005,
+        chunk_s: float = 0.007,
         **how: Any,
     ) -> list[Chunk]:
         front = EmulatedLaser(world, t0_ns=T0_NS, seed=1, **(laser or {}))
@@ -247,6 +247,7 @@ class Bench:
     """A laser and a receiver on pseudo-terminals, and the configuration that knows them."""
 
     folder: Path
+    world: World
     laser: EmulatedLaser
     receiver: EmulatedReceiver
     served: Served
@@ -274,6 +275,11 @@ class Bench:
     def sessions(self) -> list[Path]:
         return sorted((self.folder / "state" / "sessions").iterdir())
 
+    @property
+    def driven_s(self) -> float:
+        """How long the vehicle has been driving."""
+        return float(self.world.seconds(time.monotonic_ns())[0])
+
     def polite(self) -> bool:
         """Whether both devices are as a stranger would want to find them."""
         return self.laser.mode == lms.Mode.REQUEST and self.laser.baud == 9600 and not self.receiver._logs
@@ -283,13 +289,13 @@ class Bench:
 def _bench(folder: Path) -> Iterator[Bench]:
     """Devices that are aligned from the start, with nothing to write to an EEPROM, in a world of one pass.
 
-    The vehicle drives straight on and passes the pole 6 s after the laser's first scan.
+    The vehicle drives straight on and passes the pole 5 s after the laser's first scan.
     """
     now_ns = time.monotonic_ns()
     t = np.array([0.0, 1e3])
-    way = np.column_stack([3.0 * t, np.zeros(2), np.full(2, -0.1)])
-    straight = SampledTrajectory(t, way, np.zeros((2, 3)), np.tile([3.0, 0, 0], (2, 1)))
-    world = World(straight, mount=HAND_MEASURED, pole_ne_m=(18.0, 1.0))
+    way = np.column_stack([5.0 * t, np.zeros(2), np.full(2, -0.1)])
+    straight = SampledTrajectory(t, way, np.zeros((2, 3)), np.tile([5.0, 0, 0], (2, 1)))
+    world = World(straight, mount=HAND_MEASURED, pole_ne_m=(24.0, 1.0))
     laser = EmulatedLaser(world, t0_ns=now_ns - 2 * 10**9, eeprom=lms.STREAM_CONFIG)
     receiver = EmulatedReceiver(world, t0_ns=now_ns, baud=230400, aligned_after_s=-2.0)
     content = {
@@ -301,7 +307,7 @@ def _bench(folder: Path) -> Iterator[Bench]:
     }
     served = Served({folder / "lms": laser, folder / "span": receiver})
     try:
-        yield Bench(folder, laser, receiver, served, content)
+        yield Bench(folder, world, laser, receiver, served, content)
     finally:
         served.close()
 

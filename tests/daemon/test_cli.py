@@ -63,8 +63,6 @@ def test_a_session_by_hand(told, shared_bench):
     assert max(len(line) for line in out.splitlines()) <= 80
     assert len(out.splitlines()) <= 24
 
-    code, out, _ = told("start", "--force")
-    assert code == 0
     code, out, _ = told("stop")
     assert code == 0
     assert "idle" in out

@@ -275,37 +275,30 @@ def start(bench):
     return bench.config.state_dir / "sessions" / session
 
 
-def test_told_to_end_it_closes_the_capture_and_leaves_the_devices_polite(bench, running):
+def test_killed_it_leaves_a_capture_to_replay_and_told_to_end_a_closed_one(bench, running, tmp_path):
     with running(bench) as daemon:
-        folder = start(bench)
-        daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(20.0) == 0
-    assert bench.polite()
-    assert not bench.config.socket.exists()
-    capture = recorder.read(folder / "capture.mcap")
-    items = list(capture)
-    assert capture.cut is None
-    events = [item.content for item in items if isinstance(item, recorder.Event)]
-    assert events[-1]["new"] == "idle"
-    assert "stopped" in events[-1]["why"]
-
-
-def test_killed_it_leaves_a_capture_to_replay_and_the_next_daemon_goes_on(bench, running, tmp_path):
-    with running(bench) as daemon:
-        folder = start(bench)
+        killed = start(bench)
         daemon.kill()
         daemon.wait(10.0)
         killed_ns = time.monotonic_ns()
     assert not bench.polite()  # nobody could
-    capture = recorder.read(folder / "capture.mcap")
+    capture = recorder.read(killed / "capture.mcap")
     items = list(capture)
     assert "is cut off" in capture.cut
     assert (killed_ns - items[-1].t_ns) / 1e9 < 1.0
-    outcome = replay(folder / "capture.mcap", None, tmp_path / "out", None)
+    outcome = replay(killed / "capture.mcap", None, tmp_path / "out", None)
     assert outcome.status["devices"][1]["ins_status"] == "INS_SOLUTION_GOOD"
     assert outcome.cut
-    with running(bench) as daemon:
-        assert start(bench) != folder
-        daemon.terminate()
+
+    with running(bench) as daemon:  # the devices stream still, and the socket lies about
+        ended = start(bench)
+        assert ended != killed
+        daemon.send_signal(signal.SIGTERM)
         assert daemon.wait(20.0) == 0
     assert bench.polite()
+    assert not bench.config.socket.exists()
+    capture = recorder.read(ended / "capture.mcap")
+    events = [item.content for item in capture if isinstance(item, recorder.Event)]
+    assert capture.cut is None
+    assert events[-1]["new"] == "idle"
+    assert "stopped" in events[-1]["why"]
