@@ -479,3 +479,9 @@ def test_the_point_that_poses_speak_of_follows_from_the_recorded_bytes(receiver)
     assert "does not say" in span.navigation.device()["reference_point"]
     span.say("INSCONFIG")
     assert span.navigation.device()["reference_point"] == "the IMU's centre of navigation"
+
+
+def test_the_result_says_from_which_point_the_laser_is_measured(recorded):
+    (laser,) = recorded.played.pipeline.calibration()["lasers"]
+    assert laser["reference_point"].startswith("the IMU's centre of navigation")
+    assert laser["reference_point"] == recorded.played.pipeline.device("span")["reference_point"]
