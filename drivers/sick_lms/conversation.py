@@ -107,7 +107,8 @@ class Conversation:
         end_s = time.monotonic() + ack_s
         acked = False
         while (left_s := end_s - time.monotonic()) > 0:
-            for frame in self._hear(min(left_s, QUIET_S)):
+            frames = self._hear(min(left_s, QUIET_S))
+            for frame in frames:
                 if frame.command == code:
                     return frame
                 if frame.command == Refused.code:
@@ -117,7 +118,7 @@ class Conversation:
                         "it is in another mode, or of a type that lacks this: switch it off and on, "
                         "then compare its type with the configuration",
                     )
-            if self._garbled and self._quiet:
+            if self._garbled and (self._quiet or frames):  # what came broken was the answer
                 return None
             if self._refused_crc and not self._acked:
                 self.pause(_AFTER_NAK_S)

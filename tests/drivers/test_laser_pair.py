@@ -280,9 +280,8 @@ def test_interlaced_scans_join_to_one_of_180_degrees_without_levels(clock, power
     assert np.isnan(joined[0].decode(0x01).reflectivity).all()
     if not flags_in_partials:
         bearing_deg = np.degrees(bearings_rad(721, 180, 0.25))
-        ground_m = (
-            1.0 / np.sin(np.radians(8)) / np.cos(np.radians(bearing_deg[[120, 600]]))
-        )  # beside the pole
+        beside_rad = np.radians(bearing_deg[[120, 600]])
+        ground_m = 1.1 / np.sin(np.radians(8)) / np.cos(beside_rad)  # 15.8 m: more than mode 01 has in mm
         assert ranges_m[:, 360] == pytest.approx((POLE_M - 0.04) / np.cos(np.radians(8)), abs=0.02)
         assert ranges_m[:, [120, 600]] == pytest.approx(np.tile(ground_m, (len(joined), 1)), abs=0.02)
     elif unit == "cm":
@@ -477,6 +476,22 @@ def test_the_stream_is_back_within_3_s_of_the_wire_being_good(  # noqa: PLR0917
     let_through = {frame.data for _, frame in device.scans} - wire.true
     assert not let_through  # the CRC is weak (test_framer.py): of few wrong bits it misses one case in 1000
     assert (laser.mode, laser.eeprom_writes) == (Mode.REQUEST, 0)
+
+
+def test_a_broken_answer_to_the_start_does_not_hold_the_stream_up(clock, powered, meet):
+    """The scans that follow it show that no other answer will come."""
+    laser = powered(at_rate(500000), b"\x3b\x64\x00\x19\x00", eeprom=lms.STREAM_CONFIG)
+    wire = Wire(laser, lambda data: data.replace(b"\xa0", b"\xa1"))
+    device = Watched()
+    began_ns = clock.ns
+
+    def tap(direction: str, t_ns: int, data: bytes) -> None:
+        if direction == "tx" and data[4:6] == b"\x20\x24" and not wire.bad_until_ns:
+            wire.bad_until_ns = t_ns + SECOND // 5
+
+    device._tap = tap
+    meet(wire, device)
+    assert (device.scans[0][0] - began_ns) * 1e-9 < 1.5
 
 
 @pytest.mark.parametrize("late_ms", [0, 30, 150])
