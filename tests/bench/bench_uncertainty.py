@@ -3,7 +3,7 @@
 RTK-like errors: 10 mm, 0.01° roll and pitch, 0.04° yaw of each pass, 10 mm of each range. The ratio is the
 claimed σ over the errors' root mean square: 1/1.3 to 1.3 is asked for. The rest is in how many runs, in %,
 the truth lies in the 95 % region: of each unknown by the normal law and by Student's t of the passes, and of
-all that are not held together by χ² and by Fisher's F; 93 to 97 is asked for.
+all that are not held together by χ² and by Hotelling's T²; 93 to 97 is asked for.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from polecal.calib import PARAMETERS, Criteria, Mount, Pass, Result, Setup, esti
 from polecal.calib.estimate import split
 from polecal.calib.report.rig import Rig, drive
 
-HEADINGS = ("way", "passes", "unknown", "held", "bias", "scatter", "claimed", "ratio", "z, χ²", "t, F")
+HEADINGS = ("way", "passes", "unknown", "held", "bias", "scatter", "claimed", "ratio", "z, χ²", "t, T²")
 UNITS = np.array([1e3, 1e3, 1e3, *np.degrees([1, 1, 1])])  # rows are in mm and °
 
 RUNS = 500
@@ -72,5 +72,6 @@ def table(count: int, results: Sequence[Result]) -> Iterator[tuple[str | float, 
 def _covered(squares: np.ndarray, unknowns: np.ndarray, count: int) -> tuple[str, str]:
     """In how many runs, %, the truth is within 95 %: as if σ were known, and as it is, estimated."""
     known = squares < chi2.ppf(0.95, unknowns)
-    estimated = squares < unknowns * f.ppf(0.95, unknowns, count - 1)
+    left = count - unknowns
+    estimated = squares < (count - 1) * unknowns / left * f.ppf(0.95, unknowns, left)
     return f"{100 * known.mean():.1f}", f"{100 * estimated.mean():.1f}"
