@@ -29,6 +29,7 @@ METADATA = "polecal"
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
 _DAMAGE = (McapError, ValueError, struct.error, ZstdError)  # what the package raises on senseless bytes
+_CUT_OFF = "is cut off"
 _NAME_ONE = "name a capture.mcap of polecal"
 
 Direction = Literal["rx", "tx"]
@@ -209,14 +210,15 @@ class Capture:
     """A capture to iterate over: each Record and Event, in the order in which they were written.
 
     ``metadata`` is there from the start. ``cut``, once iterated, is None for a file that was closed, or
-    says in a sentence how far one that is cut off or damaged went. ``used_bytes`` of ``size_bytes`` tell
-    how far the iteration is.
+    says in a sentence how far one that is cut off or damaged went; ``damaged`` tells the second, after which
+    there may be more that is whole. ``used_bytes`` of ``size_bytes`` tell how far the iteration is.
     """
 
     def __init__(self, path: Path) -> None:
         """Read as far as the metadata. Raises RecorderError for a file that is no capture."""
         self.path = path
         self.cut: str | None = None
+        self.damaged = False
         self.used_bytes = 0
         try:
             with path.open("rb") as stream:
@@ -226,7 +228,11 @@ class Capture:
             raise RecorderError(f"{path}: cannot be read: {error.strerror}", _NAME_ONE) from error
 
     def __iter__(self) -> Iterator[Record | Event]:
-        self.cut, self.used_bytes = None, 0
+        return (item for _, _, item in self.messages())
+
+    def messages(self) -> Iterator[tuple[Channel, Message, Record | Event]]:
+        """Give each message that was recorded, as it lies in the file, with what it means."""
+        self.cut, self.damaged, self.used_bytes = None, False, 0
         count, first_ns, last_ns = 0, 0, 0
         channels: dict[int, Channel] = {}
         try:
@@ -236,12 +242,16 @@ class Capture:
                         if isinstance(record, Channel):
                             channels[record.id] = record
                             continue
-                        item = _item(record, channels.get(record.channel_id))
+                        channel = channels.get(record.channel_id)
+                        if channel is None:
+                            raise _Cut("is damaged (a message on a channel that is not there)")
+                        item = _item(record, channel)
                         if item is not None:
                             count += 1
                             first_ns, last_ns = first_ns or item.t_ns, item.t_ns
-                            yield item
+                            yield channel, record, item
         except _Cut as cut:
+            self.damaged = cut.args[0] != _CUT_OFF
             self.cut = (
                 f"{self.path} {cut}: used {self.used_bytes} of {self.size_bytes} bytes, "
                 f"{count} messages, {(last_ns - first_ns) / 1e9:.1f} s"
@@ -288,7 +298,7 @@ class Capture:
             if opcode == Opcode.FOOTER and stream.read() == _MAGIC:
                 self.used_bytes = self.size_bytes
                 return
-        raise _Cut("is cut off")
+        raise _Cut(_CUT_OFF)
 
 
 def read(path: Path) -> Capture:
@@ -317,10 +327,8 @@ def _parse(opcode: int, body: bytes) -> list[Channel | Message]:
     return []
 
 
-def _item(message: Message, channel: Channel | None) -> Record | Event | None:
-    """Say what a message is, None for those that are not for us. Raises _Cut."""
-    if channel is None:
-        raise _Cut("is damaged (a message on a channel that is not there)")
+def _item(message: Message, channel: Channel) -> Record | Event | None:
+    """Say what a message is, None for those that were not recorded but decoded. Raises _Cut."""
     try:
         if channel.topic == EVENTS:
             return Event(message.log_time, json.loads(message.data))

@@ -6,8 +6,9 @@ import contextlib
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -17,7 +18,7 @@ from polecal.daemon.config import SPAN, Config
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Recorder, RecorderError
-from polecal.daemon.replay import BEGIN, FINISH
+from polecal.daemon.replay import BEGIN, FINISH, TICK
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.sessions import Session
 from polecal.drivers.device import Device
@@ -27,7 +28,7 @@ from polecal.drivers.port import Direction, Port, Tap
 from polecal.drivers.sick_lms import SickLms
 
 _QUEUED_CHUNKS = 50_000  # minutes of both devices: a disk that stalls for longer stalls the readers
-_SYNC_S = 1.0
+_SYNC_S = 0.5  # what is written may wait for so long again, in a silence: a power cut takes 1 s at most
 
 _Chunk = tuple[str, Direction, int, bytes]
 
@@ -44,19 +45,24 @@ class _End:
 class Run:
     """A run from its start to its end; `status` and `stop` may be called from any thread."""
 
-    def __init__(self, config: Config, session: Session) -> None:
+    def __init__(
+        self, config: Config, session: Session, on_closed: Callable[[Path], None] | None = None
+    ) -> None:
+        """Prepare a run; ``on_closed`` is told the capture once it is closed. Raises RecorderError."""
         self.session = session
+        self._on_closed = on_closed
         self.ended = threading.Event()
         """Set once the devices are left, the capture is closed and the result is written."""
         self._log = structlog.get_logger().bind(session=session.id)
         self._lock = threading.Lock()
         self._queue: queue.Queue[_Chunk | _End] = queue.Queue(_QUEUED_CHUNKS)
         self._problem: PolecalError | None = None
+        self._closed_passes: list[tuple[str, StoredPass]] = []
         self._pipeline = Pipeline(
             config,
             session=session.id,
             created=session.created,
-            on_pass=self._store,
+            on_pass=lambda laser, stored: self._closed_passes.append((laser, stored)),
             on_transition=self._on_transition,
         )
         self._devices: list[Device] = [
@@ -177,6 +183,9 @@ class Run:
             try:
                 if item is not None:
                     self._take(item)
+                elif self._pipeline.routine.running:
+                    self._tick()
+                self._store_passes()
                 if time.monotonic() - synced_s >= _SYNC_S:
                     self._recorder.sync()
                     synced_s = time.monotonic()
@@ -202,6 +211,13 @@ class Run:
                 self._pipeline.feed(name, t_ns, data)
                 self._write_result()
 
+    def _tick(self) -> None:
+        """Let the pipeline know that time goes on, though nothing comes: an input, so it is recorded."""
+        now_ns = time.monotonic_ns()
+        self._recorder.event(now_ns, {"event": TICK})
+        with self._lock:
+            self._pipeline.tick(now_ns)
+
     def _end(self, end: _End) -> None:
         if end.problem is not None:
             self._fail(end.problem)
@@ -220,10 +236,14 @@ class Run:
         if calibration is not None:
             self.session.write_calibration(calibration)
 
-    def _store(self, laser: str, stored: StoredPass) -> None:
-        self._recorder.sync()
-        self.session.write_pass(laser, stored)
-        self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
+    def _store_passes(self) -> None:
+        """Write the passes that were closed; not under the lock, as a slow disk would hold up status."""
+        while self._closed_passes:
+            laser, stored = self._closed_passes[0]
+            self._recorder.sync()
+            self.session.write_pass(laser, stored)
+            self._closed_passes.pop(0)
+            self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
 
     def _on_transition(self, t_ns: int, old: State, new: State, why: str) -> None:
         self._log.info("state", old=str(old), new=str(new), why=why)
@@ -251,6 +271,8 @@ class Run:
         except RecorderError as error:
             self._fail(error)
         self.ended.set()
+        if self._on_closed is not None:
+            self._on_closed(self.session.capture)
 
 
 def joined(problems: Sequence[DeviceError]) -> DeviceError:

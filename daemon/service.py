@@ -11,6 +11,8 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -19,6 +21,7 @@ from polecal import PolecalError, __version__
 from polecal.daemon import log, sessions
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, code_of
+from polecal.daemon.finalise import Finaliser
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.run import Run, joined, silent
 
@@ -30,8 +33,10 @@ _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")
 class Service:
     """Answers the control protocol; holds at most one run."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, on_closed: Callable[[Path], None] | None = None) -> None:
+        """Serve a configuration; ``on_closed`` is told each capture that was closed."""
         self._config = config
+        self._on_closed = on_closed
         self._run: Run | None = None
         self._starting = threading.Lock()
         self._changing = threading.Lock()
@@ -89,8 +94,13 @@ class Service:
         with self._changing:
             if self._closed:
                 raise Refused("the daemon is being stopped", "start it again first", Code.BUSY)
-            run = Run(self._config, sessions.create(self._config.state_dir, self._config, name))
-            run.begin()
+            session = sessions.create(self._config.state_dir, self._config, name)
+            run = Run(self._config, session, self._on_closed)
+            try:
+                run.begin()
+            except PolecalError:
+                sessions.discard(session)  # nothing came into it
+                raise
             self._run = run
         return run
 
@@ -176,8 +186,9 @@ def _serve(config: Config) -> int:
                 "make it, or let systemd start polecal",
                 Code.NOT_PERMITTED if isinstance(error, PermissionError) else Code.CONFIG,
             ) from error
-    service = Service(config)
-    with ControlServer(config.socket, service):
+    finaliser = Finaliser(config.state_dir)
+    service = Service(config, finaliser.add)
+    with ControlServer(config.socket, service), finaliser:
         structlog.get_logger().info("ready", socket=str(config.socket), release=__version__)
         _notify("READY=1")
         stopped.wait()

@@ -1,0 +1,241 @@
+"""A closed or cut-off capture to an indexed, compressed one with the same messages; the old file until then.
+
+A process of its own does it (``python -m polecal.daemon.finalise CAPTURE``), so that it takes neither the
+interpreter nor the memory of a run that may be under way. Whatever goes wrong, the file stays as it was.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any, Self
+
+import structlog
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from mcap.writer import CompressionType, Writer
+
+from polecal import PolecalError, __version__
+from polecal.daemon import recorder
+from polecal.daemon.recorder import METADATA, RecorderError
+from polecal.daemon.sessions import CAPTURE
+
+REPAIR = "polecal.repair"
+"""The metadata record of a capture that was not closed by the daemon that wrote it."""
+
+_PART, _DAMAGED = ".part", ".damaged"
+
+
+@dataclass(frozen=True, slots=True)
+class Finalised:
+    """What became of a capture; ``recovered`` says how far it went, None for one that was closed."""
+
+    capture: str
+    messages: int
+    size_bytes: tuple[int, int]
+    """Before and after."""
+    recovered: str | None
+
+
+def is_indexed(path: Path) -> bool:
+    """Say whether a capture is as `finalise` leaves it."""
+    try:
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+    except (OSError, ValueError, McapError):
+        return False
+    return summary is not None and bool(summary.chunk_indexes)
+
+
+def finalise(path: Path, leave_bytes: int = 0) -> Finalised:
+    """Rewrite a capture indexed and compressed, all that is whole in it.
+
+    The new file has its own name until it is on the disk and was read back. A damaged original is kept
+    beside it, as more may be found in it by hand. ``leave_bytes`` must stay free on the disk meanwhile.
+
+    Raises RecorderError: the capture is as it was.
+    """
+    capture = recorder.read(path)
+    try:
+        with _alone(path.parent) as folder:
+            for left in path.parent.rglob(f".*{_PART}"):  # a crash in the midst of writing a file
+                left.unlink()
+            free_bytes = shutil.disk_usage(path.parent).free
+            if free_bytes - capture.size_bytes < leave_bytes:
+                raise OSError(errno.ENOSPC, "too little room on the disk")
+            count, size_bytes = _replace(capture)
+            os.fsync(folder)
+    except OSError as error:
+        hint = "see that the disk is there and has room; the next start tries again"
+        raise RecorderError(f"{path}: cannot be indexed: {error.strerror}", hint) from error
+    return Finalised(str(path), count, (capture.size_bytes, size_bytes), capture.cut)
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[int]:
+    """Hold a folder, as a daemon that was killed may have left a process at work in it."""
+    folder = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield folder
+    finally:
+        os.close(folder)
+
+
+def _replace(capture: recorder.Capture) -> tuple[int, int]:
+    """Put the rewritten capture in the old one's place; give its messages and bytes."""
+    path = capture.path
+    part = path.with_name(f".{path.name}{_PART}")
+    try:
+        with part.open("wb") as file:
+            count, written = _rewrite(capture, file)
+            file.flush()
+            os.fsync(file.fileno())
+        after = recorder.read(part)
+        if _digest(after) != written or after.cut is not None:
+            raise RecorderError(f"{path}: was not read back as it was written", "look at the disk's health")
+        if capture.damaged:
+            os.link(path, path.with_name(path.name + _DAMAGED))
+        size_bytes = part.stat().st_size
+        part.rename(path)
+    finally:
+        with suppress(OSError):
+            part.unlink()
+    return count, size_bytes
+
+
+def _rewrite(capture: recorder.Capture, file: IO[bytes]) -> tuple[int, bytes]:
+    """Copy a capture; give how many messages it has, and their digest."""
+    writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(library=f"polecal {__version__}")
+    writer.add_metadata(METADATA, capture.metadata)
+    channels: dict[int, int] = {}
+    digest, count = hashlib.sha256(), 0
+    for channel, message, _ in capture.messages():
+        if channel.id not in channels:
+            channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, 0)
+        writer.add_message(
+            channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+        )
+        digest.update(_identity(channel, message))
+        count += 1
+    if capture.cut is not None:
+        writer.add_metadata(REPAIR, {"recovered": capture.cut})
+    writer.finish()  # type: ignore[no-untyped-call]
+    return count, digest.digest()
+
+
+def _digest(capture: recorder.Capture) -> bytes:
+    digest = hashlib.sha256()
+    for channel, message, _ in capture.messages():
+        digest.update(_identity(channel, message))
+    return digest.digest()
+
+
+def _identity(channel: Channel, message: Message) -> bytes:
+    head = (channel.topic, message.log_time, message.publish_time, message.sequence, len(message.data))
+    return repr(head).encode() + message.data
+
+
+class Finaliser:
+    """A thread that has captures finalised one after another, the oldest session's first.
+
+    What it does not come to, the next start of the daemon does.
+    """
+
+    def __init__(self, state_dir: Path, leave_bytes: int = 0) -> None:
+        """Prepare to finalise what an earlier daemon left, not indexed yet or cut off."""
+        self._leave_bytes = leave_bytes
+        self._queue: queue.Queue[Path | None] = queue.Queue()
+        self._lock = threading.Lock()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._closed = False
+        self._log = structlog.get_logger()
+        for path in sorted((state_dir / "sessions").glob(f"*/{CAPTURE}")):
+            self._queue.put(path)
+        self._thread = threading.Thread(target=self._work, name="finaliser")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def add(self, capture: Path) -> None:
+        """Have a capture finalised that has just been closed."""
+        self._queue.put(capture)
+
+    def join(self) -> None:
+        """Wait until all is done that was asked for."""
+        self._queue.put(None)
+        self._thread.join()
+
+    def close(self) -> None:
+        """Leave the rest to the next start."""
+        with self._lock:
+            self._closed = True
+            if self._child is not None:
+                self._child.kill()
+        self.join()
+
+    def _work(self) -> None:
+        while (path := self._queue.get()) is not None:
+            if not is_indexed(path):
+                self._run(path)
+
+    def _run(self, path: Path) -> None:
+        """Finalise in a child process, unless closed."""
+        command = [sys.executable, "-m", __spec__.name, str(path), str(self._leave_bytes)]
+        with self._lock:
+            if self._closed:
+                return
+            child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # noqa: S603
+            self._child = child
+        said, trouble = child.communicate()
+        with self._lock:
+            self._child = None
+        if child.returncode < 0:
+            self._log.info("capture is left to the next start", capture=str(path))
+        elif child.returncode:
+            why = trouble.decode(errors="replace").strip().rpartition("\n")[2]
+            self._log.error("capture stays as it was written", capture=str(path), problem=why)
+        else:
+            done: dict[str, Any] = json.loads(said)
+            if done["recovered"]:
+                self._log.warning("capture repaired", **done, passes=_passes(path))
+            else:
+                self._log.info("capture indexed", **done)
+
+
+def _passes(path: Path) -> int:
+    return sum(1 for _ in (path.parent / "passes").glob("*.npz"))
+
+
+def main(argv: list[str]) -> int:
+    """Finalise one capture; say on standard output what became of it, or on stderr why it stays."""
+    os.nice(10)
+    try:
+        done = finalise(Path(argv[0]), int(argv[1]))
+    except PolecalError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    sys.stdout.write(json.dumps(asdict(done)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
