@@ -27,6 +27,8 @@ _LAST_PASSES = 3  # the rate of improvement is what these brought
 _FEWEST_POLE_RETURNS = 10
 _FEWEST_TO_DISAGREE = 6
 _MOST_SET_ASIDE = 0.25  # of all passes: where more disagree, it is not they that are wrong
+_LEAST_M = 0.02  # of √c: what few passes fit better than their returns are is fitted too well
+_FARTHEST = 20.0  # σ of the hand measurement: beyond, there is no such mount
 _ODD, _ODD_M = 6.0, 0.06  # times the passes' median, and at least so far
 _TELLING = (2e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
 """An extra known no better than this is not told: 1 cm at 5 m/s; 5 mm; 5 mm on a metre; 2 cm on ten."""
@@ -216,9 +218,9 @@ class _Problem:
     def solve(self, used: NDArray[np.bool_], *, everywhere: bool) -> _Found:
         """Find the minimum over the used passes, with what they cannot tell held as measured."""
         setup, measured = self._setup, self._measured
-        held = {*setup.hold, *EXTRAS} - setup.extras
         numbers = np.flatnonzero(used)
         enough = len(numbers) >= FEWEST_PASSES
+        held = {*setup.hold, *EXTRAS} - (setup.extras if enough else set())
         ratios = (np.inf, np.inf)
         if setup.pass_error and enough:
             rough = solve.minimise(self._form(used, ratios), measured, held)
@@ -237,7 +239,7 @@ class _Problem:
         while True:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
-            squared = whole.cost(vector)
+            squared = max(whole.cost(vector), _LEAST_M**2)
             if enough:
                 covariance = jackknife(np.stack([solve.minimise(part, vector, held) for part in without]))
             else:
@@ -251,6 +253,9 @@ class _Problem:
                 np.diag(from_model(whole.slope(at)[1], squared, count, free)) for at in (vector, measured)
             ]
             doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*best))) / believable
+            if not enough:  # few passes can be fitted by a mount that cannot be: it is not their noise
+                far = np.abs(vector - measured) / (_FARTHEST * self._measured_sigma)
+                doubt = np.maximum(doubt, far * free)
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
                 return _Found(vector, covariance, frozenset(held), ratios)
@@ -317,7 +322,7 @@ class _Problem:
             extra_sigma={UNKNOWNS[index]: float(spread[index]) for index in told},
             cost_m=cost_m,
             measured_cost_m=solve.cost_m(paper, self._measured),
-            sigma=Mount.from_vector(sigma),
+            sigma=Mount(*(float(value) for value in (*sigma[:3], *np.degrees(sigma[3:])))),
             covariance=covariance,
             held=tuple(name for name in PARAMETERS if name in held),
             improvement=improvement,

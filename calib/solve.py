@@ -25,7 +25,7 @@ UNKNOWNS = (*PARAMETERS, *EXTRAS)
 
 _STEPS = 100
 _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
-_SAME = 1 - 1e-6
+_CLEARLY = 0.995  # of √c: on flat ground the mirror image is as good, but for the noise
 _NOTHING = 1e-15
 _DESCENTS = 40
 
@@ -156,14 +156,14 @@ def minimise_globally(form: Form, start: Array, held: Collection[str] = ()) -> A
     """Give the lowest minimum there is, as far as sixty rotations spread evenly from ``start`` lead to it.
 
     The cost has false minima (paper.md, later work 6). Only rotations need be tried: for each the best
-    position follows at once, as the cost is a parabola in r_b. What is held is never turned. Of equal
-    minima the one next to ``start`` is taken.
+    position follows at once, as the cost is a parabola in r_b. What is held is never turned. Of minima
+    that are equal, or nearly so, the one next to ``start`` is taken.
     """
     near = minimise(form, start, held)
     if set(held) & {"roll", "pitch", "yaw"}:
         return near
     lowest = minimise(form, _lowest_rotation(form, start, held), held)
-    if cost_m(form, lowest) > _SAME * cost_m(form, near):
+    if cost_m(form, lowest) > _CLEARLY * cost_m(form, near):
         return near
     lowest[3:6] = roll_pitch_yaw(rotation(lowest[3:6]))  # one of the two triples that mean the same rotation
     return lowest

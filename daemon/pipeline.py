@@ -113,15 +113,14 @@ class Pipeline:
         """
         if not self.routine.running:
             return
-        self._navigation.tick(t_ns)
+        before = self.routine.state
         if device == SPAN:
             self._navigation.feed(t_ns, data)
         elif device in self._lasers:
             self._lasers[device].channel.feed(t_ns, data)
         else:
             return
-        before = self.routine.state
-        self._advance(t_ns)
+        self.tick(t_ns)
         news = self.routine.state is not before
         for laser in self._lasers.values():
             for stored in laser.channel.fuse():
@@ -129,6 +128,11 @@ class Pipeline:
                 news = True
         if news:  # a verdict changes with a pass, and counts while collecting
             self._conclude(t_ns)
+
+    def tick(self, t_ns: int) -> None:
+        """Let time go on to host time ``t_ns``, also where nothing comes any more."""
+        self._navigation.tick(t_ns)
+        self._advance(t_ns)
 
     def finish(self, t_ns: int, why: str) -> None:
         """Calibrate with what there is, and end the run."""

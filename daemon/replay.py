@@ -12,9 +12,9 @@ from polecal.daemon import recorder
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import RecorderError
 from polecal.daemon.routine import State
-from polecal.daemon.sessions import Session, SessionError
+from polecal.daemon.sessions import CALIBRATION, Session, SessionError
 
-BEGIN, FINISH = "begin", "finish"
+BEGIN, FINISH, TICK = "begin", "finish", "tick"
 """Events that are inputs of the pipeline, and so part of a replay."""
 
 _PROGRESS_EVERY = 500  # records
@@ -55,6 +55,8 @@ def replay(
     session = Session(out, recorded["created"])
     try:
         (out / "passes").mkdir(parents=True, exist_ok=True)
+        for old in (*(out / "passes").glob("*.npz"), out / CALIBRATION):  # of an earlier replay
+            old.unlink(missing_ok=True)
     except OSError as error:
         raise SessionError(
             f"{out}: cannot be made: {error.strerror}", "name another folder to write to"
@@ -72,6 +74,8 @@ def replay(
             pipeline.begin(record.t_ns)
         elif record.content.get("event") == FINISH:
             pipeline.finish(record.t_ns, record.content["why"])
+        elif record.content.get("event") == TICK:
+            pipeline.tick(record.t_ns)
         if progress is not None and number % _PROGRESS_EVERY == 0:
             progress(source.used_bytes / source.size_bytes)
     pipeline.finish(last_ns, "the capture ends here")
@@ -81,8 +85,10 @@ def replay(
     if progress is not None:
         progress(1.0)
     accepted = pipeline.routine.state is State.ACCEPTED
+    kinds = {laser.name: "sick_lms" for laser in settings.lasers} | {configuration.SPAN: "novatel_span"}
     devices = [
-        pipeline.device(name) for name in (*(laser.name for laser in settings.lasers), configuration.SPAN)
+        {"name": name, "kind": kind, "port": str(capture), "state": "replayed"} | pipeline.device(name)
+        for name, kind in kinds.items()
     ]
     status = {"class": "STATUS", "session": recorded["session"], "devices": devices} | pipeline.status()
     return Outcome(result, status, out, source.cut, accepted)

@@ -17,10 +17,11 @@ from polecal import PolecalError
 from polecal.daemon.config import SPAN, Config
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.pipeline import Pipeline
-from polecal.daemon.recorder import Recorder, RecorderError
+from polecal.daemon.recorder import FULL, DiskFull, Recorder, RecorderError
 from polecal.daemon.replay import BEGIN, FINISH, TICK
 from polecal.daemon.routine import ENDED, State
-from polecal.daemon.sessions import Session
+from polecal.daemon.sessions import Session, SessionError
+from polecal.daemon.space import Space
 from polecal.drivers.device import Device
 from polecal.drivers.errors import DeviceError, DeviceProtocolError
 from polecal.drivers.novatel_span import NovatelSpan
@@ -29,6 +30,7 @@ from polecal.drivers.sick_lms import SickLms
 
 _QUEUED_CHUNKS = 50_000  # minutes of both devices: a disk that stalls for longer stalls the readers
 _SYNC_S = 0.5  # what is written may wait for so long again, in a silence: a power cut takes 1 s at most
+_MAKE_ROOM = "make room on the disk: what is known is kept, and recording goes on"
 
 _Chunk = tuple[str, Direction, int, bytes]
 
@@ -57,12 +59,11 @@ class Run:
         self._lock = threading.Lock()
         self._queue: queue.Queue[_Chunk | _End] = queue.Queue(_QUEUED_CHUNKS)
         self._problem: PolecalError | None = None
-        self._closed_passes: list[tuple[str, StoredPass]] = []
         self._pipeline = Pipeline(
             config,
             session=session.id,
             created=session.created,
-            on_pass=lambda laser, stored: self._closed_passes.append((laser, stored)),
+            on_pass=self._store,
             on_transition=self._on_transition,
         )
         self._devices: list[Device] = [
@@ -89,6 +90,10 @@ class Run:
         self._recorder = Recorder(session.capture, session.metadata(config))
         self._stops = [threading.Event() for _ in self._devices]
         self._leaving = False
+        self._space = Space(config.state_dir, config.storage)
+        self._full: str | None = None  # why nothing is recorded
+        self._owed: _Chunk | None = None  # the first chunk without room: the recorder keeps it
+        self._missed = 0
         self._threads: list[threading.Thread] = []
         self._engine = threading.Thread(target=self._work, name="engine")
 
@@ -125,6 +130,9 @@ class Run:
                     problems.append(error)
             if problems:
                 raise joined(problems)
+            self._full = self._space.make_room(self.session.id)
+            if self._full is not None:
+                raise DiskFull(f"{self.session.folder}: {self._full}", _MAKE_ROOM)
             now_ns = time.monotonic_ns()
             self._recorder.event(now_ns, {"event": BEGIN})
             with self._lock:
@@ -148,6 +156,8 @@ class Run:
             devices = [self._device(device) for device in self._devices]
         if self._problem is not None:
             status["notes"] = [str(self._problem), *status["notes"]]
+        if self._full is not None:
+            status["notes"] = [f"nothing is recorded: {self._full}; {_MAKE_ROOM}", *status["notes"]]
         since_s = round((time.monotonic_ns() - since_ns) / 1e9, 1)
         return status | {"session": self.session.id, "since_s": since_s, "devices": devices}
 
@@ -183,12 +193,14 @@ class Run:
             try:
                 if item is not None:
                     self._take(item)
-                elif self._pipeline.routine.running:
+                elif self._pipeline.routine.running and self._full is None:
                     self._tick()
-                self._store_passes()
                 if time.monotonic() - synced_s >= _SYNC_S:
-                    self._recorder.sync()
                     synced_s = time.monotonic()
+                    self._look_at_disk()
+                    self._recorder.sync()
+            except DiskFull as error:
+                self._pause(str(error))
             except PolecalError as error:
                 self._fail(error)
             except Exception as error:  # a bug: what comes in is still recorded, and the devices are left
@@ -204,12 +216,46 @@ class Run:
         if isinstance(item, _End):
             self._end(item)
             return
-        name, direction, t_ns, data = item
-        self._recorder.write(name, direction, t_ns, data)
+        if self._full is not None:
+            self._missed += 1
+            return
+        try:
+            self._recorder.write(*item)
+        except DiskFull as error:
+            self._owed = item
+            self._pause(str(error))
+        else:
+            self._hear(item)
+
+    def _hear(self, chunk: _Chunk) -> None:
+        """Feed the pipeline what is in the capture, and nothing else."""
+        name, direction, t_ns, data = chunk
         if direction == "rx" and self._problem is None and self._pipeline.routine.running:
             with self._lock:
                 self._pipeline.feed(name, t_ns, data)
                 self._write_result()
+
+    def _look_at_disk(self) -> None:
+        """Stop to record while there is too little room, and go on once there is enough."""
+        if self._full is None:
+            if self._space.lacking() and (why := self._space.make_room(self.session.id)):
+                self._pause(why)
+        elif self._space.make_room(self.session.id) is None:
+            self._recorder.settle()
+            owed, self._owed = self._owed, None
+            missed, self._missed = self._missed, 0
+            self._full = None
+            self._log.info("recording goes on", missed_chunks=missed)
+            if owed is not None:
+                self._hear(owed)
+            self._recorder.event(time.monotonic_ns(), {"event": "recording goes on", "missed_chunks": missed})
+
+    def _pause(self, why: str) -> None:
+        if self._full is None:
+            self._log.error("disk full", problem=why, hint=_MAKE_ROOM)
+            with contextlib.suppress(DiskFull):
+                self._recorder.event(time.monotonic_ns(), {"event": "disk full", "why": why})
+        self._full = why
 
     def _tick(self) -> None:
         """Let the pipeline know that time goes on, though nothing comes: an input, so it is recorded."""
@@ -236,18 +282,18 @@ class Run:
         if calibration is not None:
             self.session.write_calibration(calibration)
 
-    def _store_passes(self) -> None:
-        """Write the passes that were closed; not under the lock, as a slow disk would hold up status."""
-        while self._closed_passes:
-            laser, stored = self._closed_passes[0]
-            self._recorder.sync()
-            self.session.write_pass(laser, stored)
-            self._closed_passes.pop(0)
-            self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
+    def _store(self, laser: str, stored: StoredPass) -> None:
+        """Write a pass before anybody can see that it is closed."""
+        self._recorder.sync()
+        self.session.write_pass(laser, stored)
+        self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
 
     def _on_transition(self, t_ns: int, old: State, new: State, why: str) -> None:
         self._log.info("state", old=str(old), new=str(new), why=why)
-        self._recorder.event(t_ns, {"event": "state", "old": old, "new": new, "why": why})
+        try:
+            self._recorder.event(t_ns, {"event": "state", "old": old, "new": new, "why": why})
+        except DiskFull as error:  # not through the pipeline, which is in the midst of a chunk
+            self._pause(str(error))
 
     def _fail(self, error: PolecalError) -> None:
         if self._problem is None:

@@ -186,7 +186,7 @@ def _serve(config: Config) -> int:
                 "make it, or let systemd start polecal",
                 Code.NOT_PERMITTED if isinstance(error, PermissionError) else Code.CONFIG,
             ) from error
-    finaliser = Finaliser(config.state_dir)
+    finaliser = Finaliser(config.state_dir, config.storage.min_free_mb * 1_000_000)
     service = Service(config, finaliser.add)
     with ControlServer(config.socket, service), finaliser:
         structlog.get_logger().info("ready", socket=str(config.socket), release=__version__)

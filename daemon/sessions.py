@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
@@ -97,6 +98,11 @@ def create(state_dir: Path, config: Config, name: str | None) -> Session:
     with _whole_file(folder / "session.yaml") as file:
         file.write(yaml.safe_dump(session.metadata(config), sort_keys=False).encode())
     return session
+
+
+def discard(session: Session) -> None:
+    """Remove the folder of a session that never began."""
+    shutil.rmtree(session.folder, ignore_errors=True)
 
 
 def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:

@@ -288,9 +288,6 @@ def test_on_flat_ground_z_is_held_as_measured_and_said_to_be(flat):
     assert max(abs(off[key]) for key in ("x_m", "y_m")) <= 0.015
 
 
-@pytest.mark.xfail(
-    strict=True, reason="calib: of a minimum and its mirror image, the one that noise makes lower is taken"
-)
 def test_on_flat_ground_of_mirror_images_the_one_near_the_hand_measurement_is_taken(flat):
     """Upside down and under the ground everything fits as well: roll and pitch with their signs changed."""
     played, truth = flat
