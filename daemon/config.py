@@ -265,6 +265,13 @@ class Accept(_Part):
     max_sigma: MaxSigma = MaxSigma()
 
 
+class Storage(_Part):
+    """How much of the disk the sessions may take (MB of 10⁶ bytes): the oldest that were not accepted go."""
+
+    min_free_mb: Annotated[int, Field(ge=1)] = 200
+    quota_mb: Annotated[int, Field(ge=1)] | None = None
+
+
 class Config(_Part):
     """All that the daemon is told."""
 
@@ -275,6 +282,7 @@ class Config(_Part):
     pole: Pole
     routine: Routine = Routine()
     accept: Accept = Accept()
+    storage: Storage = Storage()
 
     @property
     def socket(self) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import struct
@@ -30,6 +31,7 @@ _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
 _DAMAGE = (McapError, ValueError, struct.error, ZstdError)  # what the package raises on senseless bytes
 _CUT_OFF = "is cut off"
+FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAME_ONE = "name a capture.mcap of polecal"
 
 Direction = Literal["rx", "tx"]
@@ -37,6 +39,10 @@ Direction = Literal["rx", "tx"]
 
 class RecorderError(PolecalError):
     """A capture that cannot be written, or read."""
+
+
+class DiskFull(RecorderError):
+    """There is no room for a message; it is kept, and goes before any other once there is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +119,11 @@ class Recorder:
                 self._channels[topic, encoding] = channel
             self._messages += 1
             self._writer.add_message(channel, t_ns, data, t_ns, self._messages)
+
+    def settle(self) -> None:
+        """Write what there was no room for. Raises DiskFull if there still is none."""
+        with self._lock:
+            self._file.settle()
 
     def sync(self) -> None:
         """Wait until all that was written is on the disk; writers need not wait. Raises RecorderError."""
@@ -200,7 +211,8 @@ class _WholeWrites:
         os.close(fd)
 
     def _error(self, error: OSError) -> RecorderError:
-        return RecorderError(
+        kind = DiskFull if error.errno in FULL else RecorderError
+        return kind(
             f"{self._path}: cannot be written: {error.strerror}",
             "see that the disk is there, has room (`df -h`) and that this user may write to it",
         )

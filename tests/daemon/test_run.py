@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from polecal.daemon import recorder, sessions
+from polecal.daemon.config import Storage
 from polecal.daemon.recorder import RecorderError
 from polecal.daemon.replay import BEGIN, FINISH, replay
 from polecal.daemon.routine import State
@@ -151,27 +152,33 @@ def fill(path):
             file.write(bytes(1 << 14))
 
 
-def test_a_disk_that_fills_up_ends_the_run_as_a_fault_and_keeps_closed_passes(
+def test_a_full_disk_stops_recording_keeps_all_that_is_known_and_goes_on_when_there_is_room(
     bench, begin, until, small_disk
 ):
     disk = small_disk("24m")
-    run = begin(bench, state_dir=disk)
+    run = begin(bench, state_dir=disk, storage=Storage(min_free_mb=1))
     until(lambda: run.status()["lasers"][0]["passes"] == 1)
     with pytest.raises(OSError, match="No space"):
         fill(disk / "filler")
-    assert run.ended.wait(20.0)
-    assert run.state is State.FAULT
-    (note, *_) = run.status()["notes"]
-    assert "No space left on device" in note
-    assert str(run.session.capture) in note
+    until(lambda: any("nothing is recorded" in note for note in run.status()["notes"]))
+    assert run.state is State.COLLECTING
+    assert run.status()["lasers"][0]["estimate"] is not None
+    until(lambda: run._missed > 20)
+    assert states(run) == STREAMING
+    (disk / "filler").unlink()
+    until(lambda: run._full is None)
+    heard = run.status()["devices"][0]["frames"]
+    until(lambda: run.status()["devices"][0]["frames"] > heard)
+    run.stop("asked to stop", calibrate=True)
     assert bench.polite()
     with np.load(run.session.folder / "passes" / "front-001.npz") as stored:
         assert len(stored["range_m"]) > 100
-    capture = recorder.read(run.session.capture)
-    assert sum(isinstance(item, recorder.Record) for item in capture) > 500
-    (disk / "filler").unlink()
+    events = [item.content for item in recorder.read(run.session.capture) if hasattr(item, "content")]
+    (missed,) = (event["missed_chunks"] for event in events if event["event"] == "recording goes on")
+    assert missed > 20
     outcome = replay(run.session.capture, None, bench.folder / "out", None)
-    assert outcome.status["lasers"][0]["passes"] == 1
+    assert outcome.cut is None
+    assert (outcome.out / CALIBRATION).read_bytes() == (run.session.folder / CALIBRATION).read_bytes()
 
 
 def test_a_capture_that_cannot_be_begun_opens_no_port(bench, monkeypatch):

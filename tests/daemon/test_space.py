@@ -1,0 +1,64 @@
+"""Room on the disk: the oldest sessions go that were not accepted, and no other."""
+
+import pytest
+import yaml
+from structlog.testing import capture_logs
+
+from polecal.daemon.config import ConfigError, Storage
+from polecal.daemon.space import Space
+
+MB = 1_000_000
+STATES = {"1-old": None, "2-accepted": "accepted", "3-rejected": "rejected", "4-odd": "", "5-now": None}
+
+
+@pytest.fixture
+def state(tmp_path):
+    """Five sessions of a MB each, oldest first."""
+    for name, verdict in STATES.items():
+        folder = tmp_path / "sessions" / name
+        (folder / "passes").mkdir(parents=True)
+        (folder / "capture.mcap").write_bytes(bytes(MB - 100_000))
+        (folder / "passes" / "front-001.npz").write_bytes(bytes(90_000))
+        if verdict is not None:
+            text = yaml.safe_dump({"state": verdict}) if verdict else "\0 no YAML"
+            (folder / "calibration.yaml").write_text(text)
+    return tmp_path
+
+
+def left(state):
+    return sorted(path.name for path in (state / "sessions").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("quota_mb", "gone"), [(None, []), (6, []), (4, ["1-old"]), (3, ["1-old", "3-rejected"])]
+)
+def test_a_quota_takes_the_oldest_that_were_not_accepted(state, quota_mb, gone):
+    with capture_logs() as logs:
+        assert Space(state, Storage(min_free_mb=1, quota_mb=quota_mb)).make_room("5-now") is None
+    assert left(state) == [name for name in STATES if name not in gone]
+    assert [entry["session"] for entry in logs] == gone
+
+
+def test_neither_the_running_one_nor_accepted_ones_nor_unreadable_results_ever_go(state):
+    Space(state, Storage(min_free_mb=1, quota_mb=1)).make_room("5-now")
+    assert left(state) == ["2-accepted", "4-odd", "5-now"]
+
+
+def test_a_floor_takes_only_as_many_as_are_needed_and_is_told_where_it_cannot_be_kept(state, monkeypatch):
+    space = Space(state, Storage(min_free_mb=10))
+    full = {name: 9_500_000 for name in STATES}
+    monkeypatch.setattr(
+        Space, "_free_bytes", lambda self: full["5-now"] + MB * (len(STATES) - len(left(state)))
+    )
+    assert "only 10 MB" in space.lacking()
+    assert space.make_room("5-now") is None
+    assert left(state) == [name for name in STATES if name != "1-old"]
+    full["5-now"] = 0
+    assert space.make_room("5-now") == "only 2 MB are free on the disk, of 10 that must be"
+    assert left(state) == ["2-accepted", "4-odd", "5-now"]
+
+
+def test_what_makes_no_sense_is_a_fault(settings):
+    with pytest.raises(ConfigError, match=r"storage\.min_free_mb"):
+        settings(storage={"min_free_mb": 0})
+    assert settings(storage={"quota_mb": 5000}).storage == Storage(min_free_mb=200, quota_mb=5000)
