@@ -100,6 +100,21 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("capture", type=Path, metavar="CAPTURE")
     replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
     replay.add_argument("--out", type=Path, metavar="DIR", help="where calibration and passes go")
+    imported = verb(_import, "make a capture of raw serial dumps, for replay")
+    imported.add_argument("--lms", type=Path, required=True, metavar="FILE", help="what the laser said")
+    imported.add_argument("--span", type=Path, required=True, metavar="FILE", help="what the receiver said")
+    for name in ("lms", "span"):
+        imported.add_argument(
+            f"--{name}-arrivals", type=Path, metavar="CSV", help="byte_offset,host_time_s of its dump"
+        )
+        imported.add_argument(
+            f"--{name}-rate", type=float, metavar="B", help="bytes/s without arrivals, else its line's rate"
+        )
+    imported.add_argument("--config", type=Path, required=True, metavar="FILE", help="what it replays with")
+    imported.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="the capture to make")
+    export = verb(_export, "write a capture's bytes as raw serial dumps, a file a device")
+    export.add_argument("capture", type=Path, metavar="CAPTURE")
+    export.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the dumps go")
     decode = verb(_decode, "print a raw byte file as JSON lines, one a frame")
     decode.add_argument("file", metavar="FILE", help="- for standard input")
     decode.add_argument("--as", dest="kind", choices=["sick_lms", "novatel_span"], required=True)
@@ -276,6 +291,36 @@ def _progress() -> Iterator[Callable[[float], None] | None]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("replay", total=1.0)
         yield lambda done: bar.update(task, completed=done)
+
+
+def _import(arguments: argparse.Namespace) -> int:
+    from polecal.daemon import config as configuration  # noqa: PLC0415
+    from polecal.daemon.transfer import import_dumps, line_rate  # noqa: PLC0415
+
+    config = configuration.load(arguments.config)
+    laser = config.lasers[0]
+    dumps = {
+        laser.name: (
+            arguments.lms,
+            arguments.lms_arrivals or arguments.lms_rate or line_rate(laser.baud),
+        ),
+        configuration.SPAN: (
+            arguments.span,
+            arguments.span_arrivals or arguments.span_rate or line_rate(config.navigation.baud),
+        ),
+    }
+    for note in import_dumps(arguments.out, config, dumps):
+        _complain(f"warning: {note}", "give its arrival times")
+    print(f"capture: {arguments.out}")
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from polecal.daemon.transfer import export_dumps  # noqa: PLC0415
+
+    for path in export_dumps(arguments.capture, arguments.out):
+        print(path)
+    return 0
 
 
 def _decode(arguments: argparse.Namespace) -> int:
