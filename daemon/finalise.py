@@ -208,7 +208,9 @@ class Finaliser:
         said, trouble = child.communicate()
         with self._lock:
             self._child = None
-        if child.returncode < 0:
+        if child.returncode < 0 and is_indexed(path):  # killed just after it was done
+            self._log.info("capture indexed", capture=str(path))
+        elif child.returncode < 0:
             self._log.info("capture is left to the next start", capture=str(path))
         elif child.returncode:
             why = trouble.decode(errors="replace").strip().rpartition("\n")[2]

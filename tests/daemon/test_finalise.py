@@ -55,6 +55,38 @@ def test_the_messages_are_the_same_in_the_same_order_and_so_is_the_calibration(r
     assert (outcome.out / CALIBRATION).read_bytes() == (live.out / CALIBRATION).read_bytes()
 
 
+def test_the_official_reader_finds_it_indexed_compressed_and_its_crcs_right(tmp_path):
+    path = session(tmp_path, "a")
+    before = list(recorder.read(path))
+    finalise(path)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        seen = [
+            (channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()
+        ]
+        (metadata,) = reader.iter_metadata()
+    assert summary.statistics.message_count == len(seen) == len(before) == 204
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+    raw = [(item.t_ns, item.data) for item in before if isinstance(item, recorder.Record)]
+    assert [(t_ns, data) for topic, t_ns, data in seen if topic == "/front/rx"] == raw
+    assert (metadata.name, metadata.metadata) == ("polecal", METADATA)
+
+
+def test_a_daemon_finalises_at_its_start_and_when_a_session_ends(bench, running, until):
+    from polecal.daemon.control import Client
+
+    crashed = session(bench.folder / "state", "20261122T000000Z-crashed", close=False)
+    with running(bench), Client(bench.config.socket, 60.0) as client:
+        until(lambda: is_indexed(crashed))
+        assert client.request({"class": "START", "name": "yard"})["class"] == "STARTED"
+        client.request({"class": "STOP"})
+        log = bench.folder / "polecald.log"
+        until(lambda: "capture repaired" in log.read_text() and "capture indexed" in log.read_text())
+    assert len(bench.sessions) == 2
+    assert all(is_indexed(folder / "capture.mcap") for folder in bench.sessions)
+
+
 def test_one_that_was_cut_off_is_repaired_and_tells_so(tmp_path):
     path = session(tmp_path, "a", close=False)
     os.truncate(path, path.stat().st_size - 3)
