@@ -19,15 +19,14 @@ T0_NS = 10**12
 SET_UP_S = 5.0
 
 
-def check(calibration, true, capsys):
+def check(calibration, true, tell):
     """State what was reached, and hold it to what the demonstration must reach."""
     (laser,) = calibration["lasers"]
-    with capsys.disabled():
-        for key, value in asdict(true).items():
-            found, sigma = laser["estimate"][key], laser["sigma"][key]
-            held = " held" if key.partition("_")[0] in laser["held"] else ""
-            print(f"\n  {key:9} found {found:8.4f} ± {sigma:.4f} true {value:8.4f}{held}", end="")
-        print(f"\n  √c {laser['cost_m']:.4f} m, by hand {laser['measured_cost_m']:.4f} m")
+    for key, value in asdict(true).items():
+        found, sigma = laser["estimate"][key], laser["sigma"][key]
+        held = " held" if key.partition("_")[0] in laser["held"] else ""
+        tell(f"{key:9} found {found:8.4f} ± {sigma:.4f} true {value:8.4f}{held}")
+    tell(f"√c {laser['cost_m']:.4f} m, by hand {laser['measured_cost_m']:.4f} m")
     for key, value in asdict(true).items():
         error = abs(laser["estimate"][key] - value)
         assert error <= (0.08 if key.endswith("deg") else 0.05 if key == "z_m" else 0.015), key
@@ -35,7 +34,7 @@ def check(calibration, true, capsys):
     assert all(part["done"] for part in laser["coverage"])
 
 
-def test_pose_is_found_on_a_recorded_drive(captures, config, capsys):
+def test_pose_is_found_on_a_recorded_drive(captures, config, tell):
     rig = driven_rig(captures / DRIVEN, T0_NS)
     rig.laser.force_stream(T0_NS)
     rig.receiver.receive(T0_NS, b"LOG INSPVAXB ONTIME 0.05\r\n", rig.receiver.baud)
@@ -46,11 +45,11 @@ def test_pose_is_found_on_a_recorded_drive(captures, config, capsys):
     for name, t_ns, data in play(devices, start_ns=T0_NS, seconds=rig.seconds + 2):
         pipeline.feed(name, t_ns, data)
     pipeline.finish(t_ns, "the drive is over")
-    check(pipeline.calibration(), rig.true, capsys)
+    check(pipeline.calibration(), rig.true, tell)
 
 
 @pytest.mark.realtime
-def test_whole_daemon_finds_the_pose_on_a_recorded_drive_in_real_time(captures, config, capsys):
+def test_whole_daemon_finds_the_pose_on_a_recorded_drive_in_real_time(captures, config, tell):
     rig = driven_rig(captures / DRIVEN, time.monotonic_ns())
     links = {config.lasers[0].port: rig.laser, config.navigation.port: rig.receiver}
     stop, ready = threading.Event(), threading.Event()
@@ -69,7 +68,7 @@ def test_whole_daemon_finds_the_pose_on_a_recorded_drive_in_real_time(captures, 
         service.close()
         stop.set()
         server.join()
-    check(calibration, rig.true, capsys)
+    check(calibration, rig.true, tell)
     assert rig.laser.eeprom_writes <= 1
 
 

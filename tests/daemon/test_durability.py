@@ -155,7 +155,7 @@ def records(capture):
     return [(item.device, item.t_ns) for item in capture if isinstance(item, recorder.Record)]
 
 
-def test_fifty_kills_lose_no_message_and_no_pass_and_every_session_is_repaired(killed):
+def test_fifty_kills_lose_no_message_and_no_pass_and_every_session_is_repaired(killed, tell):
     rng = random.Random(7)
     delays_s = [rng.uniform(1.8, 2.4) for _ in range(8)] + [rng.uniform(0, 0.5) for _ in range(KILLS - 8)]
     runs = killed(delays_s, at_once=4, pause_s=0.0)
@@ -178,7 +178,7 @@ def test_fifty_kills_lose_no_message_and_no_pass_and_every_session_is_repaired(k
                 assert len(stored["range_m"]) == count
     messages = sum(len(run.written) for run in runs)
     passes = sum(len(run.passes) for run in runs)
-    print(f"{KILLS} kills: {messages} messages and {passes} passes told, none lost")
+    tell(f"{KILLS} kills: {messages} messages and {passes} passes told, none lost")
     assert messages > 100 * KILLS
     assert passes > 0
 
@@ -197,7 +197,7 @@ def on_disk(run, inodes):
     return files
 
 
-def test_a_power_cut_loses_a_second_at_most_and_no_pass_and_leaves_nothing_corrupt(killed, tmp_path):
+def test_a_power_cut_loses_a_second_at_most_and_no_pass_and_leaves_nothing_corrupt(killed, tmp_path, tell):
     runs = killed([0.6, 1.1, 1.7, 2.4], at_once=4, pause_s=0.02)
     worst_s = passes = 0
     for run in runs:
@@ -221,6 +221,6 @@ def test_a_power_cut_loses_a_second_at_most_and_no_pass_and_leaves_nothing_corru
             with np.load(path) as stored:
                 assert len(stored["range_m"]) == count
             passes += 1
-    print(f"power cuts: at most {worst_s:.2f} s lost, {passes} passes kept")
+    tell(f"power cuts: at most {worst_s:.2f} s lost, {passes} passes kept")
     assert 0 < worst_s <= LOST_BY_A_POWER_CUT_S
     assert passes > 0

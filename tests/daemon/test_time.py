@@ -84,15 +84,14 @@ def prompt():
     return run()
 
 
-def test_an_unknown_delay_of_the_laser_is_found_and_costs_nothing(prompt, capsys):
+def test_an_unknown_delay_of_the_laser_is_found_and_costs_nothing(prompt, tell):
     undelayed, its_error = prompt
     result, error = run(delay_s=0.040)
     one_stamp, _ = run(delay_s=0.040, one_stamp=True)
-    with capsys.disabled():
-        found_ms = -1e3 * (result.extras["time_s"] - undelayed.extras["time_s"])
-        print(f"\n  40 ms late, 5 m/s: found {found_ms:.2f} ms")
-        print(f"  x y z m, roll pitch yaw °: {np.round(error, 4)}; without delay {np.round(its_error, 4)}")
-        print(f"  √c {result.cost_m:.3f} m; with one timestamp a scan {one_stamp.cost_m:.3f} m")
+    found_ms = -1e3 * (result.extras["time_s"] - undelayed.extras["time_s"])
+    tell(f"40 ms late, 5 m/s: found {found_ms:.2f} ms")
+    tell(f"x y z m, roll pitch yaw ° off: {np.round(error, 4)}; without delay {np.round(its_error, 4)}")
+    tell(f"√c {result.cost_m:.3f} m; with one timestamp a scan {one_stamp.cost_m:.3f} m")
     assert result.extras["time_s"] - undelayed.extras["time_s"] == pytest.approx(-0.040, abs=0.002)
     assert result.extra_sigma["time_s"] < 0.001
     free = np.array([name not in result.held for name in ("x", "y", "z", "roll", "pitch", "yaw")])

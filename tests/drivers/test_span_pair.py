@@ -298,7 +298,7 @@ def test_a_receiver_that_is_left_is_silent(make):
 
 def test_a_recorded_drive_comes_through_byte_for_byte(make, captures):
     recording = load_recording(captures / DRIVEN)
-    receiver = PlaybackReceiver(*recording, t0_ns=time.monotonic_ns(), baud=921600, speed=60.0)
+    receiver = PlaybackReceiver(*recording, t0_ns=time.monotonic_ns(), baud=921600, speed=20.0)
     host = make(receiver, host_baud=921600, rate_hz=20.0)
     host.wait_for(lambda: host.device.state == "streaming")
     host.wait_for(lambda: receiver.done)

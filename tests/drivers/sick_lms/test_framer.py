@@ -106,8 +106,8 @@ def flipped(data: bytes, bit: int) -> bytes:
     return data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]
 
 
-def test_a_telegram_spoilt_in_any_way_is_a_bad_frame_with_its_reason(usable):
-    print("\nharm                         telegrams  reasons")
+def test_a_telegram_spoilt_in_any_way_is_a_bad_frame_with_its_reason(usable, tell):
+    tell("harm                         telegrams  reasons")
     for harm, (spoil, allowed) in HARMS.items():
         told: Counter[str] = Counter()
         for name, data in usable.items():
@@ -120,11 +120,11 @@ def test_a_telegram_spoilt_in_any_way_is_a_bad_frame_with_its_reason(usable):
             reason = next(skip.reason for skip in skips if skip.reason not in ("noise", "ack", "nak"))
             assert reason in allowed, (harm, name)
             told[reason] += 1
-        print(f"{harm:28} {sum(told.values()):9}  {dict(told)}")
+        tell(f"{harm:28} {sum(told.values()):9}  {dict(told)}")
         assert sum(told.values()) > 80
 
 
-def test_what_the_weak_crc_misses_is_known():
+def test_what_the_weak_crc_misses_is_known(tell):
     """One wrong bit never; two in one case of 1000, more in one of some 10000: it shifts once a byte.
 
     A bit, and the next higher one in the next byte, are the same to it. So a line that flips bits may let a
@@ -139,7 +139,7 @@ def test_what_the_weak_crc_misses_is_known():
     bits = 8 * (size - 2)
     missed = sum(n * (n - 1) // 2 for n in syndromes.values())
     share = missed / (bits * (bits - 1) / 2)
-    print(f"\ntwo wrong bits in {size} bytes: {missed} of {bits * (bits - 1) // 2} pairs missed, {share:.2%}")
+    tell(f"two wrong bits in {size} bytes: {missed} of {bits * (bits - 1) // 2} pairs missed, {share:.2%}")
     assert 0 not in syndromes
     assert crc16(bytes([0, 1, 2, 0])) == 0
     assert 0.0005 < share < 0.0015

@@ -50,7 +50,7 @@ def frame_of(data: bytes) -> Frame:
     return frame
 
 
-def test_every_telegram_of_the_sheet_is_read_and_built_again(usable):
+def test_every_telegram_of_the_sheet_is_read_and_built_again(usable, tell):
     covered = {}
     for name, data in (usable | NOT_PRINTED).items():
         frame = frame_of(data)
@@ -60,9 +60,9 @@ def test_every_telegram_of_the_sheet_is_read_and_built_again(usable):
         known = Scan if frame.command in SCAN_CODES else CLASSES[frame.command]
         assert known.parse(frame).build(frame.address) == data, name
         covered.setdefault(frame.command, []).append(name)
-    print("\ncode  telegrams covered")
+    tell("code  telegrams covered")
     for code, names in sorted(covered.items()):
-        print(f"{code:02X}    {len(names):2}  {names[0]}")
+        tell(f"{code:02X}    {len(names):2}  {names[0]}")
     wanted = "10 20 30 31 32 35 36 37 3A 3B 44 4A 66 74 75 77 7B 90 91 92 A0 B0 B1 B2 B5 B6 B7 BA BB C4 CA E6"
     assert set(bytes.fromhex(wanted)) | {0xBF, 0xF4, 0xF5, 0xF7, 0xFB} == set(covered)
 
