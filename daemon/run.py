@@ -94,6 +94,7 @@ class Run:
         self._full: str | None = None  # why nothing is recorded
         self._owed: _Chunk | None = None  # the first chunk without room: the recorder keeps it
         self._missed = 0
+        self._unstored: list[tuple[str, StoredPass]] = []
         self._threads: list[threading.Thread] = []
         self._engine = threading.Thread(target=self._work, name="engine")
 
@@ -245,6 +246,7 @@ class Run:
             owed, self._owed = self._owed, None
             missed, self._missed = self._missed, 0
             self._full = None
+            self._store_passes()
             self._log.info("recording goes on", missed_chunks=missed)
             if owed is not None:
                 self._hear(owed)
@@ -284,9 +286,24 @@ class Run:
 
     def _store(self, laser: str, stored: StoredPass) -> None:
         """Write a pass before anybody can see that it is closed."""
-        self._recorder.sync()
-        self.session.write_pass(laser, stored)
-        self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
+        self._unstored.append((laser, stored))
+        self._store_passes()
+
+    def _store_passes(self) -> None:
+        """Write the passes that are closed; for which there is no room, those are kept until there is."""
+        try:
+            while self._unstored:
+                laser, stored = self._unstored[0]
+                self._recorder.sync()
+                self.session.write_pass(laser, stored)
+                self._unstored.pop(0)
+                self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
+        except DiskFull as error:
+            self._pause(str(error))
+        except SessionError as error:
+            if not (isinstance(error.__cause__, OSError) and error.__cause__.errno in FULL):
+                raise
+            self._pause(str(error))
 
     def _on_transition(self, t_ns: int, old: State, new: State, why: str) -> None:
         self._log.info("state", old=str(old), new=str(new), why=why)

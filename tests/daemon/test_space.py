@@ -1,10 +1,14 @@
 """Room on the disk: the oldest sessions go that were not accepted, and no other."""
 
+from contextlib import suppress
+
 import pytest
 import yaml
 from structlog.testing import capture_logs
 
+from polecal.daemon import sessions
 from polecal.daemon.config import ConfigError, Storage
+from polecal.daemon.run import Run
 from polecal.daemon.space import Space
 
 MB = 1_000_000
@@ -62,3 +66,23 @@ def test_what_makes_no_sense_is_a_fault(settings):
     with pytest.raises(ConfigError, match=r"storage\.min_free_mb"):
         settings(storage={"min_free_mb": 0})
     assert settings(storage={"quota_mb": 5000}).storage == Storage(min_free_mb=200, quota_mb=5000)
+
+
+def test_a_pass_that_is_closed_on_a_full_disk_is_written_once_there_is_room(recorded, settings, small_disk):
+    disk = small_disk("3m")
+    config = settings(state_dir=str(disk), storage={"min_free_mb": 1})
+    run = Run(config, sessions.create(config.state_dir, config, None))
+    filler = disk / "filler"
+    with filler.open("wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(bytes(1 << 12))
+    laser, stored = recorded.played.passes[0]
+    run._store(laser, stored)
+    passes = run.session.folder / "passes"
+    assert not list(passes.iterdir())
+    assert "nothing is recorded" in run.status()["notes"][0]
+    filler.unlink()
+    run._look_at_disk()
+    assert [path.name for path in passes.iterdir()] == ["front-001.npz"]
+    assert not any("nothing is recorded" in note for note in run.status()["notes"])
+    run._close()
