@@ -27,6 +27,7 @@ _SCANS = frozenset((VALUES, ENERGY, S14))  # by levels, or what it fell back to;
 _REVOLUTION_NS = round(REVOLUTION_S * 1e9)
 _MIRROR_DRIFT = 5e-3  # a motor, not a crystal: 75 Hz is 13.33 ms, the sheet's 148 µs word says 13.32 ms
 _SILENCE_NS = 2_000_000_000  # after which it may have been switched off, and count from anywhere
+_EARLY_SCANS = 0.1  # by which a clock that is still being learnt may put a scan too late
 _MOST_WAITING = 256  # scans that wait for their poses: 14 s at 18.8 Hz
 _SLOWEST_MPS, _SLOWEST_RADPS = 0.05, 0.02  # a vehicle that stands adds weight and no information
 _GATE_M = (0.5, 2.5)
@@ -82,6 +83,7 @@ class LaserChannel:
         self._bearing_rad = bearings_rad(count, laser.fov_deg, laser.resolution_deg)
         ages_s = beam_ages_s(laser.fov_deg, laser.resolution_deg, count)
         self._age_ns = np.round(ages_s * 1e9).astype(np.int64)
+        self._scan_revolutions = int(np.ceil(ages_s.max() / REVOLUTION_S))
         self._byte_ns = BITS_PER_BYTE * 1e9 / laser.baud
 
     def feed(self, t_ns: int, data: bytes) -> None:
@@ -118,21 +120,28 @@ class LaserChannel:
         self._waiting.append(_Waiting(stx_ns, decoded.ranges_m, decoded.reflectivity, found))
 
     def _stx_ns(self, frame: Frame, scan: Scan) -> int | None:
-        """Give the host time at which the telegram's first byte left, by the mirror's own clock.
-
-        A laser that does not number its revolutions is stamped as its bytes came.
-        """
+        """Give the host time at which the telegram's first byte left, by the mirror's own clock."""
         stamp_ns = round(frame.t_first_ns - frame.lead_bytes * self._byte_ns)
-        if scan.scan_index is None:
-            return stamp_ns
         if self._revolutions is not None and stamp_ns - self._revolutions[1] > _SILENCE_NS:
             self._clock, self._revolutions = Clock(max_drift=_MIRROR_DRIFT), None
-        count, at_ns = self._revolutions or (scan.scan_index, stamp_ns)
-        guess = count + (stamp_ns - at_ns) / _REVOLUTION_NS  # the counter is mod 256: 3.4 s
-        count = scan.scan_index + 256 * round((guess - scan.scan_index) / 256)
+        count = self._revolution(stamp_ns, scan.scan_index)
         self._revolutions = count, stamp_ns
         self._clock.update(count * _REVOLUTION_NS, stamp_ns)
         return self._clock.to_host(count * _REVOLUTION_NS) if self._clock.locked else None
+
+    def _revolution(self, stamp_ns: int, scan_index: int | None) -> int:
+        """Give the number of the revolution that a scan ended in, where it is not told by the arrivals."""
+        if self._revolutions is None:
+            return scan_index or 0
+        count, at_ns = self._revolutions
+        if scan_index is not None:  # mod 256: 3.4 s
+            guess = count + (stamp_ns - at_ns) / _REVOLUTION_NS
+            return scan_index + 256 * round((guess - scan_index) / 256)
+        if self._clock.locked:
+            at_ns = self._clock.to_host(count * _REVOLUTION_NS)
+        # Stamps are late, by less than a scan, and never early: what is over a whole number is lateness.
+        scans = int((stamp_ns - at_ns) / (self._scan_revolutions * _REVOLUTION_NS) + _EARLY_SCANS)
+        return count + self._scan_revolutions * max(1, scans)
 
     def fuse(self) -> list[StoredPass]:
         """Place the scans whose poses are all there; give the passes that have ended."""

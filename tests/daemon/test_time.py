@@ -53,13 +53,24 @@ class Faster:
         return self._of.at(np.asarray(t_s) * self._times)
 
 
-def run(*, delay_s=0.0, one_stamp=False, usb_s=0.002, seconds=80.0, after=lambda chunks: chunks, seed=2):
+def run(
+    *,
+    delay_s=0.0,
+    one_stamp=False,
+    usb_s=0.002,
+    seconds=80.0,
+    after=lambda chunks: chunks,
+    seed=2,
+    indices=True,
+):
     """The pipeline's laser at 5 m/s, of a world whose laser's bytes all come ``delay_s`` late."""
     world = demo_world(seed)
     world.trajectory, world.nav_error = Faster(world.trajectory, 1.75), Faster(world.nav_error, 1.75)
     laser = EmulatedLaser(world, t0_ns=T0_NS, seed=1, drift_ppm=50.0)
     receiver = EmulatedReceiver(world, t0_ns=T0_NS, seed=1, drift_ppm=-50.0)
     laser.force_stream(T0_NS)
+    if not indices:
+        laser._state.config = without_indices(laser._state.config)
     receiver.force_logs(T0_NS, STREAM_LOGS)
     pipeline = Pipeline(loads(yaml.safe_dump(CONFIG)))
     pipeline.begin(T0_NS)
@@ -77,6 +88,11 @@ def run(*, delay_s=0.0, one_stamp=False, usb_s=0.002, seconds=80.0, after=lambda
     pipeline.finish(t_ns, "the drive is over")
     result = pipeline._lasers["front"].result
     return result, np.abs(np.subtract(astuple(result.mount), astuple(world.mount)))
+
+
+def without_indices(config):
+    """The same configuration, availability bit 1 (sheet, 3.2) off."""
+    return config[:4] + bytes([config[4] & ~0x02]) + config[5:]
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +121,15 @@ def test_a_usb_adapter_that_hands_on_every_16_ms_costs_little(prompt):
     assert error[:2].max() < 0.015
     assert error[3:].max() < 0.08
     assert abs(result.extras["time_s"] - prompt[0].extras["time_s"]) < 0.003
+
+
+def test_a_laser_that_does_not_number_its_revolutions_is_counted_by_its_arrivals(prompt):
+    rng = np.random.default_rng(5)
+    lossy = lambda chunks: (chunk for chunk in chunks if rng.random() > 0.002)  # noqa: E731
+    result, error = run(usb_s=0.008, indices=False, after=lossy)
+    assert error[:2].max() < 0.015
+    assert error[3:].max() < 0.08
+    assert result.cost_m < 1.1 * prompt[0].cost_m
 
 
 def test_lost_telegrams_and_a_laser_that_restarts_misplace_nothing():
