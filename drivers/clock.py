@@ -6,6 +6,10 @@ negative. So the line below all points (device time, host time) is the clock, up
 Of the hull the edge over the middle of the window is taken, which minimises the points' mean distance. An
 oscillator wanders, so a window that slides is needed: two hulls that start half a window apart, the older
 one in use (as ethz-asl/cuckoo_time_translator switches).
+
+Olson's passive filter (IROS 2010) must let its offset age by the largest drift there may be; the hull learns
+the drift. On the same stamps, USB timer 16 ms and ±50 ppm, the hull's p99 is 0.06 ms and Olson's 0.36 ms
+(``./dev bench clock``).
 """
 
 from __future__ import annotations
