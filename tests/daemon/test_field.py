@@ -149,11 +149,10 @@ def test_start_says_what_streams(run, daemon):
 @pytest.mark.parametrize("code", [4, 75, 77])
 def test_a_start_that_is_refused_says_why_and_what_to_do(run, daemon, code):
     daemon.error = Refused("/dev/lms: another program holds it", "stop it", code)
-    assert run("start") == (
-        code,
-        "",
-        "polecal-field: /dev/lms: another program holds it\nhint: stop it\n",
-    )
+    exit_code, out, err = run("start")
+    assert (exit_code, out) == (code, "")
+    # On a busy machine what it waits for stands before.
+    assert err.splitlines()[-2:] == ["polecal-field: /dev/lms: another program holds it", "hint: stop it"]
     code_again, out, _ = run("--json", "start")
     assert code_again == code
     assert json.loads(out) == {
