@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from typing import TypeVar
 
 E = TypeVar("E", bound=IntEnum)
@@ -296,16 +296,6 @@ class PortId(IntEnum):
     COM2 = 0x40
     COM3 = 0x60
     THISPORT = 0xC0
-
-
-class ExtendedStatus(IntFlag):
-    """Bits of the extended INS status that calibration looks at (sheet 3.2)."""
-
-    POSITION_UPDATE = 1 << 0
-    ZERO_VELOCITY_UPDATE = 1 << 2
-    CONVERGED = 1 << 6
-    DEAD_RECKONING = 1 << 11
-    ALIGNMENT_DIRECTION_VERIFIED = 1 << 25
 
 
 class ImuType(IntEnum):
