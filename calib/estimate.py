@@ -40,6 +40,8 @@ class Pass:
 
     id: int
     blocks: dict[tuple[int, Kind], Moments]
+    site: int = 0
+    """Passes of another day have another: pole and ground are compared within a site only."""
 
     def total(self, kind: Kind) -> Moments:
         """Give the moments of one kind, over all slices."""
@@ -207,10 +209,14 @@ class _Problem:
     """The passes of one laser, ready to be solved without some of them."""
 
     def __init__(self, passes: Sequence[Pass], setup: Setup) -> None:
+        sites = [one.site for one in passes]
         self.pole = Scatter(
-            [one.total(Kind.POLE) for one in passes], shift_m=axis_shift_m(setup.pole_radius_m), ranged=True
+            [one.total(Kind.POLE) for one in passes],
+            shift_m=axis_shift_m(setup.pole_radius_m),
+            ranged=True,
+            sites=sites,
         )
-        self.ground = Scatter([one.total(Kind.GROUND) for one in passes])
+        self.ground = Scatter([one.total(Kind.GROUND) for one in passes], sites=sites)
         self._passes, self._setup = passes, setup
         self._measured = np.concatenate([setup.measured.vector, np.zeros(len(EXTRAS))])
         self._measured_sigma = np.concatenate([setup.measured_sigma.vector, _TELLING])
@@ -274,8 +280,7 @@ class _Problem:
             seen = numbers[scatter.count[numbers] > 0]
             if not len(seen):
                 continue
-            means = scatter.means(rows)[seen]
-            off_m = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+            off_m = np.linalg.norm(scatter.off(rows, seen), axis=1)
             spread_m = np.sqrt(scatter.within(rows)[seen])
             for values, words in (
                 (off_m, f"its {what} is {{:.2f}} m off"),

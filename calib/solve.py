@@ -31,13 +31,21 @@ _DESCENTS = 40
 
 
 class Scatter:
-    """The spread of one kind of returns: within each pass, and of the passes' means.
+    """The spread of one kind of returns: within each pass, and of the passes' means about their site's.
 
     Takes each pass's moments. ``shift_m`` is a range offset that is known; ``ranged`` says whether these
-    returns take part in one that is not.
+    returns take part in one that is not. ``sites`` has a number a pass: of another day, where the pole and
+    the ground are not where they were; else all are of one.
     """
 
-    def __init__(self, passes: Sequence[Moments], *, shift_m: float = 0.0, ranged: bool = False) -> None:
+    def __init__(
+        self,
+        passes: Sequence[Moments],
+        *,
+        shift_m: float = 0.0,
+        ranged: bool = False,
+        sites: Sequence[int] | None = None,
+    ) -> None:
         fold = np.eye(WIDTH)
         fold[RANGE, RANGE] *= ranged
         fold[RANGE, 0:6] = shift_m * np.eye(6)
@@ -45,6 +53,7 @@ class Scatter:
         self.count = np.array([one.count for one in passes], dtype=np.float64)
         self._mean = np.stack([one.first / max(1, one.count) for one in passes]) @ three  # (P, 108)
         self._within = np.stack([one.count * (three.T @ one.covariance() @ three) for one in passes])
+        self.sites = np.zeros(len(passes), dtype=np.int64) if sites is None else np.array(sites)
 
     def form(self, used: NDArray[np.bool_], ratio: float = np.inf) -> Array:
         """Give the covariance (108, 108) of the used passes' features, m².
@@ -57,7 +66,9 @@ class Scatter:
         if not total:
             return np.zeros((3 * WIDTH, 3 * WIDTH))
         weight = self.count[used] / (1.0 + self.count[used] / ratio)
-        apart = self._mean[used] - weight / weight.sum() @ self._mean[used]
+        apart = self._mean[used]
+        for site in _each(self.sites[used]):
+            apart[site] -= weight[site] / (weight[site].sum() or 1.0) @ apart[site]
         form: Array = (self._within[used].sum(axis=0) + (weight[:, None] * apart).T @ apart) / total
         return form
 
@@ -75,12 +86,30 @@ class Scatter:
     def ratio(self, rows: Array, used: NDArray[np.bool_]) -> float:
         """Estimate `form`'s ratio from the used passes themselves."""
         there = used & (self.count > 0)
-        count = self.count[there]
-        if len(count) < 2:
+        count, means = self.count[there], self.means(rows)[there]
+        sites = _each(self.sites[there])
+        free = len(count) - len(sites)
+        if free < 1:
             return np.inf
         within = float((count * self.within(rows)[there]).sum() / count.sum())
-        apart = float(self.means(rows)[there].var(axis=0, ddof=1).mean()) - within * float((1 / count).mean())
+        spread = np.zeros(len(rows))
+        for site in sites:
+            if (more := int(site.sum()) - 1) > 0:
+                spread += means[site].var(axis=0, ddof=1) * (more / free)
+        apart = float(spread.mean()) - within * float((1 / count).mean())
         return within / apart if apart > 0 else np.inf
+
+    def off(self, rows: Array, used: NDArray[np.int64]) -> Array:
+        """Give how far the means (U, k), in the given rows (k, 108), of passes are from their site's median."""
+        off = self.means(rows)[used]
+        for site in _each(self.sites[used]):
+            off[site] -= np.median(off[site], axis=0)
+        return off
+
+
+def _each(sites: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
+    """Give, site by site, which are of it."""
+    return [sites == site for site in np.unique(sites)]
 
 
 @dataclass(frozen=True, slots=True)
