@@ -35,6 +35,7 @@ _START_S = 300.0  # a device search tries every rate, twice, and may write an EE
 _STOP_S = 120.0  # the devices are left polite, and what there is may be calibrated
 _POLL_S = 0.5
 _DECODE_BYTES = 4096
+_FORMATS = ("yaml", "json", "urdf", "ros2", "autoware", "snark", "libbot")
 _EXIT_BY_STATE = {State.ACCEPTED: 0, State.REJECTED: Code.REJECTED, State.FAULT: Code.DEVICE}
 _WORKING = (State.CONNECTING, State.ALIGNING, State.COLLECTING)
 
@@ -94,8 +95,9 @@ def _parser() -> argparse.ArgumentParser:
     stop = verb(_stop, "end the session")
     stop.add_argument("--calibrate", action="store_true", help="calibrate with what there is")
     result = verb(_result, "print a calibration, by default the last accepted one")
-    result.add_argument("session", nargs="?", metavar="SESSION")
-    result.add_argument("--format", choices=["yaml", "json"], default="yaml")
+    result.add_argument("session", nargs="?", metavar="SESSION", help="its name, or a folder's path")
+    result.add_argument("--format", choices=_FORMATS, default="yaml", help="for which system")
+    result.add_argument("--parent", metavar="FRAME", help="the body's frame, else as that system calls it")
     replay = verb(_replay, "run a capture through the whole pipeline again, without a daemon")
     replay.add_argument("capture", type=Path, metavar="CAPTURE")
     replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
@@ -246,18 +248,29 @@ def _stop(arguments: argparse.Namespace) -> int:
 
 
 def _result(arguments: argparse.Namespace) -> int:
-    with Client(arguments.socket, _ANSWER_S) as client:
-        answer = client.request({"class": "RESULT", "session": arguments.session})
+    if arguments.session and os.sep in arguments.session:
+        from polecal.daemon.sessions import read_calibration  # noqa: PLC0415
+
+        answer = {"class": "RESULT"} | read_calibration(Path(arguments.session))
+    else:
+        with Client(arguments.socket, _ANSWER_S) as client:
+            answer = client.request({"class": "RESULT", "session": arguments.session})
     content = {key: value for key, value in answer.items() if key != "class"}
+    verdicts = [laser["verdict"]["accepted"] for laser in content["lasers"]]
+    accepted = content.get("state") == State.ACCEPTED and all(verdicts)
     if arguments.json:
         _print_json(answer)
-    elif arguments.format == "json":
+    elif accepted and arguments.format == "json":
         print(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
-    else:
+    elif accepted and arguments.format == "yaml":
         import yaml  # noqa: PLC0415
 
         print(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), end="")
-    if content.get("state") == State.REJECTED:
+    else:
+        from polecal.calib.export import export  # noqa: PLC0415
+
+        print(export(content, arguments.format, arguments.parent), end="")
+    if not accepted:
         _complain("this calibration was rejected", "see the reasons in its verdict; do not use it")
         return Code.REJECTED
     return 0

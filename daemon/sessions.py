@@ -119,6 +119,19 @@ def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
     raise SessionError(wanted, "see `polecal-field status` for what is still to be driven")
 
 
+def read_calibration(folder: Path) -> dict[str, Any]:
+    """Read the calibration in a folder, of a session or of a replay. Raises SessionError."""
+    path = folder / CALIBRATION
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        why = error.strerror if isinstance(error, OSError) else "is no calibration"
+        raise SessionError(f"{path}: {why}", "name a folder with a calibration.yaml in it") from error
+    if not isinstance(content, dict) or not isinstance(content.get("lasers"), list):
+        raise SessionError(f"{path}: is no calibration", "name a folder with a calibration.yaml in it")
+    return content
+
+
 @contextmanager
 def _whole_file(path: Path) -> Iterator[IO[bytes]]:
     """Write a file that is there as a whole or not at all, also after a power cut. Raises SessionError."""

@@ -23,7 +23,17 @@ STREAMING = [
     {"name": "span", "port": "/dev/span", "state": "streaming"},
 ]
 
-LASERS = [{"name": "front", "cost_m": 0.03}]
+POSE = {"x_m": 0.1, "y_m": 0.2, "z_m": -1.0, "roll_deg": 1.0, "pitch_deg": -8.0, "yaw_deg": 2.0}
+LASERS = [
+    {
+        "name": "front",
+        "cost_m": 0.03,
+        "estimate": POSE,
+        "sigma": POSE,
+        "held": [],
+        "verdict": {"accepted": True, "reasons": []},
+    }
+]
 
 
 class Daemon:
@@ -264,6 +274,36 @@ def test_result_as_yaml_json_and_object(run, daemon):
     assert daemon.asked[-1] == {"class": "RESULT", "session": "s1"}
     _, out, _ = run("--json", "result")
     assert json.loads(out) == {"class": "RESULT"} | content
+
+
+@pytest.mark.parametrize("form", field._FORMATS)
+def test_a_result_in_every_format_and_a_rejected_one_says_so_in_it(run, daemon, form):
+    code, out, err = run("result", "--format", form)
+    assert (code, err, "REJECTED" in out) == (0, "", False)
+    assert "front" in out
+    daemon.result = "rejected"
+    code, out, err = run("result", "--format", form)
+    assert (code, "was rejected" in err) == (5, True)
+    assert "REJECTED - DO NOT USE" in "".join(out.splitlines()[:3])
+
+
+def test_the_formats_are_those_that_there_are(run, tmp_path):
+    from polecal.calib.export import FORMATS
+
+    assert tuple(FORMATS) == field._FORMATS
+
+
+def test_a_result_from_a_folder_needs_no_daemon(run, daemon, tmp_path):
+    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump({"state": "accepted", "lasers": LASERS}))
+    code, out, _ = run("result", f"{tmp_path}/", "--format", "urdf", "--parent", "ins")
+    assert (code, daemon.asked) == (0, [])
+    assert '<parent link="ins"/>' in out
+    (tmp_path / "calibration.yaml").write_text("lasers: 3\n")
+    for folder in (tmp_path, tmp_path / "none"):
+        code, out, err = run("result", f"{folder}/")
+        assert (code, out) == (1, "")
+        assert "calibration.yaml" in err
+        assert "hint: " in err
 
 
 def test_a_rejected_result_is_printed_but_not_as_a_success(run, daemon):
