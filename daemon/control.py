@@ -1,4 +1,8 @@
-"""JSON objects, a line each, over a Unix socket: the daemon's side of it and the operator's."""
+"""JSON objects, a line each, over a Unix socket: the daemon's side of it and the operator's.
+
+Who may connect is what the socket's mode and access list say: root, the daemon's own user and the group, and
+whom the administrator lets in besides. All of them may look; to change what runs takes one of the former.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ import stat
 import struct
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -28,11 +33,16 @@ PROTO = (1, 0)
 GROUP = "polecal"
 MAX_LINE_BYTES = 64 * 1024
 REQUESTS = ("START", "STATUS", "WATCH", "STOP", "RESULT", "PASSES", "DROP", "KEEP", "SESSIONS", "REPORT")
+LOOKING = frozenset({"STATUS", "WATCH", "RESULT", "PASSES", "SESSIONS"})
+"""What whoever may connect may ask; the rest is for root, the daemon's own user and the group."""
 
 _WATCH_S = 1.0
 _MAX_CLIENTS = 32
 _SEND_S = 5.0  # a client that takes nothing for so long is dropped
-_PEERCRED = struct.Struct("3i")  # pid, uid, gid
+_PEERCRED = struct.Struct("iII")  # struct ucred: pid, uid, gid
+_SO_PEERGROUPS = 59  # socket(7) has it since Linux 4.13, Python has no name for it
+_GROUPS_BYTES = 1024  # as many as Python's getsockopt can give, 256
+_LOGGED = 200  # characters
 
 
 class Code(IntEnum):
@@ -74,6 +84,35 @@ class Handler(Protocol):
         WATCH comes as a STATUS a second. Raises PolecalError, which the client gets as an ERROR.
         """
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """The process at the other end of a Unix socket, as it was when it connected."""
+
+    pid: int
+    uid: int
+    gids: frozenset[int]
+
+    @classmethod
+    def of(cls, connection: socket.socket) -> Self:
+        """Ask the kernel. Raises OSError."""
+        ucred = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEERCRED.size)
+        pid, uid, gid = _PEERCRED.unpack(ucred)
+        more = b""
+        with contextlib.suppress(OSError):  # an older kernel, or more groups: the first one counts
+            more = connection.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _GROUPS_BYTES)
+        return cls(pid, uid, frozenset({gid, *memoryview(more).cast("I")}))
+
+    @property
+    def may_change(self) -> bool:
+        """Whether it is root, the daemon's own user or a member of the group."""
+        if self.uid in (0, os.geteuid()):
+            return True
+        try:
+            return grp.getgrnam(GROUP).gr_gid in self.gids
+        except KeyError:
+            return False
 
 
 def code_of(error: PolecalError) -> int:
@@ -249,12 +288,13 @@ class ControlServer:
                 thread.start()
 
     def _serve(self, connection: socket.socket) -> None:
-        credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEERCRED.size)
-        pid, uid, gid = _PEERCRED.unpack(credentials)
-        log = self._log.bind(pid=pid, uid=uid, gid=gid)
-        log.debug("client connected")
+        log = self._log
         lines = _Lines(connection, MAX_LINE_BYTES)
+        seen: set[str] = set()
         try:
+            peer = Peer.of(connection)
+            log = log.bind(pid=peer.pid, uid=peer.uid)
+            log.debug("client connected")
             lines.write({"class": "VERSION", "release": __version__, "proto": list(PROTO)})
             while not self._closing.is_set():
                 try:
@@ -265,7 +305,15 @@ class ControlServer:
                 except Refused as error:
                     lines.write(as_message(error))
                     continue
-                if request["class"] == "WATCH":
+                name = request["class"]
+                again = name in LOOKING and name in seen  # who polls is in the log once
+                (log.debug if again else log.info)("asked", **_told(request))
+                seen.add(name)
+                if name not in LOOKING and not peer.may_change:
+                    refused = _not_permitted(peer, name)
+                    log.warning("refused", request=name, problem=str(refused), code=refused.code)
+                    lines.write(as_message(refused))
+                elif name == "WATCH":
                     self._watch(lines, log)
                 else:
                     lines.write(self._answer(request, log))
@@ -284,19 +332,35 @@ class ControlServer:
                 return
 
     def _answer(self, request: Message, log: structlog.typing.FilteringBoundLogger) -> Message:
-        level = log.debug if request["class"] == "STATUS" else log.info
-        level("asked", request=request["class"])
         try:
             reply = self._handler.handle(request)
             encode(reply)
         except PolecalError as error:
-            level("refused", request=request["class"], problem=str(error), code=code_of(error))
+            log.info("refused", request=request["class"], problem=str(error), code=code_of(error))
             return as_message(error)
         except Exception as error:
             log.exception("a request failed", request=request)
             hint = "its log has more (`journalctl -u polecal`): please report it"
             return as_message(Refused(f"polecald failed at it: {error!r}", hint))
         return reply
+
+
+def _told(request: Message) -> dict[str, str]:
+    """Give what the log shall have of a request: not more than fits on a line, whatever the client sent."""
+    more = {
+        key: value
+        for key, value in request.items()
+        if key != "class" and value is not None and value is not False
+    }
+    return {"request": request["class"]} | ({"with": f"{more}"[:_LOGGED]} if more else {})
+
+
+def _not_permitted(peer: Peer, name: str) -> Refused:
+    return Refused(
+        f"uid {peer.uid} may look, but {name} is only for root and members of group {GROUP}",
+        f"add the user to the group (`sudo usermod -aG {GROUP} $USER`), then log in again",
+        Code.NOT_PERMITTED,
+    )
 
 
 def _parse(line: bytes) -> Message:

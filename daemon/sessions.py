@@ -106,9 +106,17 @@ def discard(session: Session) -> None:
 
 
 def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
-    """Read a session's calibration; the last accepted one's if none is named. Raises SessionError."""
+    """Read a session's calibration; the last accepted one's if none is named. Raises SessionError.
+
+    A session is one of the folders that are there, so that no name and no link leads anywhere else.
+    """
     folder = state_dir / "sessions"
-    names = sorted((path.name for path in folder.glob("*/") if (path / CALIBRATION).is_file()), reverse=True)
+    inside = folder.resolve()
+    files = (path / CALIBRATION for path in folder.glob("*/"))
+    names = sorted(
+        (file.parent.name for file in files if file.is_file() and file.resolve().parent.parent == inside),
+        reverse=True,
+    )
     if session is not None:
         names = [name for name in names if name == session]
     for name in names:
