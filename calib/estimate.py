@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import add
 
@@ -104,14 +104,23 @@ def sum_of(blocks: Iterable[Moments]) -> Moments:
 
 
 def split(returns: Returns, slice_deg: int) -> dict[tuple[int, Kind], Moments]:
-    """Sum up returns by slice of platform yaw and kind."""
-    slices = slice_of(returns.rpy_rad[:, 2], slice_deg)
-    blocks = {}
+    """Sum up one pass's returns by slice of platform yaw and kind."""
+    one = replace(returns, pass_id=np.zeros(len(returns), dtype=np.int64))
+    return passes_of(one, slice_deg)[0].blocks if len(one) else {}
+
+
+def passes_of(returns: Returns, slice_deg: int, *, timed: bool = True) -> list[Pass]:
+    """Sum up returns by pass, slice of platform yaw and kind; ready for a time offset if ``timed``."""
+    numbers, index = np.unique(returns.pass_id, return_inverse=True)
+    slices = 360 // slice_deg
+    group = index * slices + slice_of(returns.rpy_rad[:, 2], slice_deg)
+    passes = [Pass(int(number), {}) for number in numbers]
     for kind in Kind:
-        of_kind = returns.kind == kind
-        for part in np.unique(slices[of_kind]):
-            blocks[int(part), kind] = moments.of(returns[of_kind & (slices == part)])
-    return blocks
+        of_kind = np.flatnonzero(returns.kind == kind)
+        blocks = moments.by_group(returns, of_kind, group[of_kind], ranged=kind is Kind.POLE, timed=timed)
+        for label, block in blocks.items():
+            passes[label // slices].blocks[label % slices, kind] = block
+    return passes
 
 
 def calibrate(
@@ -153,10 +162,7 @@ def calibrate(
         Where there are not enough pole returns to speak of.
     """
     need = need or Need()
-    passes = [
-        Pass(int(number), split(returns[returns.pass_id == number], need.slice_deg))
-        for number in np.unique(returns.pass_id)
-    ]
+    passes = passes_of(returns, need.slice_deg, timed="time_s" in extras)
     setup = Setup(
         measured=mount,
         measured_sigma=measured_sigma,

@@ -13,24 +13,26 @@ Array = NDArray[np.float64]
 
 def rotation(rpy_rad: Array) -> Array:
     """Give C = Rz(yaw) Ry(pitch) Rx(roll), (..., 3, 3), of (..., 3) roll, pitch, yaw in rad."""
+    return _matrices(rotation_entries(rpy_rad))
+
+
+def rotation_entries(rpy_rad: Array) -> tuple[Array, ...]:
+    """Give the nine entries (...) of `rotation`, row by row, each an array of its own."""
     c, s = np.cos(rpy_rad), np.sin(rpy_rad)
     cr, cp, cy = c[..., 0], c[..., 1], c[..., 2]
     sr, sp, sy = s[..., 0], s[..., 1], s[..., 2]
-    entries = (
+    return (
         *(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
         *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
         *(-sp, cp * sr, cp * cr),
     )
-    return _matrices(entries)
 
 
 def rotation_gradient(rpy_rad: Array) -> Array:
     """Give dC/d(roll, pitch, yaw), (3, 3, 3): the first index is the angle; for one (3,) triple in rad."""
-    roll, pitch, yaw = (rotation(np.where(np.arange(3) == axis, rpy_rad, 0.0)) for axis in range(3))
-    spin = [skew(np.eye(3)[axis]) for axis in range(3)]
-    return np.stack(
-        [yaw @ pitch @ roll @ spin[0], yaw @ pitch @ spin[1] @ roll, yaw @ spin[2] @ pitch @ roll]
-    )
+    c = rotation(rpy_rad)
+    pitched = np.array([-np.sin(rpy_rad[2]), np.cos(rpy_rad[2]), 0.0])  # the axis of pitch, yawed
+    return np.stack([c @ _SPIN[0], skew(pitched) @ c, _SPIN[2] @ c])
 
 
 def roll_pitch_yaw(matrix: Array) -> Array:
@@ -63,3 +65,6 @@ def _matrices(entries: tuple[Array, ...]) -> Array:
     for index, entry in enumerate(entries):
         matrices[..., index] = entry
     return matrices.reshape(*np.shape(entries[0]), 3, 3)
+
+
+_SPIN = skew(np.eye(3))

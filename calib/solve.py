@@ -46,13 +46,14 @@ class Scatter:
         ranged: bool = False,
         sites: Sequence[int] | None = None,
     ) -> None:
-        fold = np.eye(WIDTH)
-        fold[RANGE, RANGE] *= ranged
-        fold[RANGE, 0:6] = shift_m * np.eye(6)
-        three = np.kron(np.eye(3), fold)
         self.count = np.array([one.count for one in passes], dtype=np.float64)
-        self._mean = np.stack([one.first / max(1, one.count) for one in passes]) @ three  # (P, 108)
-        self._within = np.stack([one.count * (three.T @ one.covariance() @ three) for one in passes])
+        self._mean = np.stack([one.first / max(1, one.count) for one in passes])  # (P, 108)
+        self._within = np.stack([one.count * one.covariance() for one in passes])
+        three = self._within.reshape(-1, 3, WIDTH, 3, WIDTH)
+        for features in (self._mean.reshape(-1, 3, WIDTH), three, three.swapaxes(2, 4)):  # views
+            features[..., 0:6] += shift_m * features[..., RANGE]
+            features[..., RANGE] *= ranged
+        self._all_within = self._within.sum(axis=0)
         self.sites = np.zeros(len(passes), dtype=np.int64) if sites is None else np.array(sites)
 
     def form(self, used: NDArray[np.bool_], ratio: float = np.inf) -> Array:
@@ -65,12 +66,24 @@ class Scatter:
         total = self.count[used].sum()
         if not total:
             return np.zeros((3 * WIDTH, 3 * WIDTH))
-        weight = self.count[used] / (1.0 + self.count[used] / ratio)
+        weight = self._weight(used, ratio)
         apart = self._mean[used]
         for site in _each(self.sites[used]):
             apart[site] -= weight[site] / (weight[site].sum() or 1.0) @ apart[site]
-        form: Array = (self._within[used].sum(axis=0) + (weight[:, None] * apart).T @ apart) / total
+        few = used.sum() < len(used) / 2
+        within = self._within[used].sum(axis=0) if few else self._all_within - self._within[~used].sum(axis=0)
+        form: Array = (within + (weight[:, None] * apart).T @ apart) / total
         return form
+
+    def weighted_mean(self, used: NDArray[np.bool_], ratio: float = np.inf) -> tuple[float, Array]:
+        """Give what the used passes weigh together, and their mean (108,) so weighed."""
+        weight = self._weight(used, ratio)
+        total = float(weight.sum())
+        return total, weight / max(total, 1e-300) @ self._mean[used]
+
+    def _weight(self, used: NDArray[np.bool_], ratio: float) -> Array:
+        weight: Array = self.count[used] / (1.0 + self.count[used] / ratio)
+        return weight
 
     def means(self, rows: Array) -> Array:
         """Give each pass's mean (P, k) in the given rows (k, 108): `_rows` of a vector."""
@@ -100,7 +113,7 @@ class Scatter:
         return within / apart if apart > 0 else np.inf
 
     def off(self, rows: Array, used: NDArray[np.int64]) -> Array:
-        """Give how far the means (U, k), in the given rows (k, 108), of passes are from their site's median."""
+        """Give how far passes' means (U, k), in the rows (k, 108), are from their site's median."""
         off = self.means(rows)[used]
         for site in _each(self.sites[used]):
             off[site] -= np.median(off[site], axis=0)
@@ -121,13 +134,15 @@ class Form:
 
     def cost(self, vector: Array) -> float:
         """Give c in m² at ``vector`` (12,)."""
-        pole, ground = pole_rows(vector), ground_rows(vector)
+        h = _h(vector)
+        pole, ground = _rows(_pole_weights(vector)[0], h), _rows(_ground_weights(vector)[0], h)
         return max(0.0, float((pole @ self.pole * pole).sum() + (ground @ self.ground * ground).sum()))
 
     def slope(self, vector: Array) -> tuple[Array, Array]:
         """Give half the gradient (12,) and half the Gauss-Newton Hessian (12, 12) of c."""
         gradient, hessian = np.zeros(len(UNKNOWNS)), np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
-        h, dh = _h(vector), _h_gradient(vector)
+        h = _h(vector)
+        dh = _h_gradient(vector, h)
         for matrix, weights in ((self.pole, _pole_weights(vector)), (self.ground, _ground_weights(vector))):
             for weight, dweight in zip(*weights, strict=True):
                 jacobian = (weight[:, None, None] * dh + dweight[:, None] * h[:, None]).reshape(3 * WIDTH, -1)
@@ -144,12 +159,17 @@ def cost_m(form: Form, vector: Array) -> float:
 
 def pole_rows(vector: Array) -> Array:
     """Give what turns features into north and east of the pole, its lean taken off: (2, 108)."""
-    return (_pole_weights(vector)[0][:, :, None] * _h(vector)).reshape(2, 3 * WIDTH)
+    return _rows(_pole_weights(vector)[0], _h(vector))
 
 
 def ground_rows(vector: Array) -> Array:
     """Give what turns features into down of the ground, its slope taken off: (1, 108)."""
-    return (_ground_weights(vector)[0][:, :, None] * _h(vector)).reshape(1, 3 * WIDTH)
+    return _rows(_ground_weights(vector)[0], _h(vector))
+
+
+def _rows(weights: Array, h: Array) -> Array:
+    """Give what turns features into so weighted axes of n: (k, 108) of (k, 3) and (36,)."""
+    return (weights[:, :, None] * h).reshape(-1, 3 * WIDTH)
 
 
 def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:
@@ -265,7 +285,7 @@ def _h(vector: Array) -> Array:
     return np.concatenate([h, range_m * columns, time_s * h, time_s**2 * h])
 
 
-def _h_gradient(vector: Array) -> Array:
+def _h_gradient(vector: Array, h: Array) -> Array:
     """Give the derivative of h⁺ by the unknowns, (36, 12)."""
     time_s, range_m = vector[6:8]
     gradient = np.zeros((WIDTH, len(UNKNOWNS)))
@@ -275,7 +295,6 @@ def _h_gradient(vector: Array) -> Array:
     gradient[RANGE, 3:6] = range_m * turned
     gradient[TIME, :6] = time_s * gradient[BASE, :6]
     gradient[TIME_SQUARED, :6] = time_s**2 * gradient[BASE, :6]
-    h = _h(vector)
     gradient[TIME, 6] = h[BASE]
     gradient[TIME_SQUARED, 6] = 2 * time_s * h[BASE]
     gradient[RANGE, 7] = h[:6]

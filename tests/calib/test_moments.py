@@ -46,6 +46,36 @@ def test_moments_of_parts_add_up_and_come_off_again(returns):
     np.testing.assert_allclose(left.first, m.of(first).first, rtol=1e-9, atol=1e-6)
 
 
+def test_moments_of_groups_are_those_of_each_by_itself_however_they_are_mixed(returns):
+    rng = np.random.default_rng(0)
+    picked, group = rng.permutation(len(returns))[:9000], rng.integers(3, 6, 9000)
+    groups = m.by_group(returns, picked, group)
+    assert sorted(groups) == [3, 4, 5]
+    for number, block in groups.items():
+        alone = m.of(returns[picked[group == number]])
+        assert block.count == alone.count
+        np.testing.assert_allclose(block.first, alone.first, rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(block.second, alone.second, rtol=1e-12, atol=1e-9)
+
+
+def test_what_is_not_asked_for_is_left_out_and_the_rest_the_same(returns):
+    still = np.zeros((len(returns), 3))
+    moving = replace(
+        returns,
+        velocity_mps=still + 1.0,
+        rate_radps=still,
+        acceleration_mps2=still,
+        angular_acceleration_radps2=still,
+    )
+    every = np.arange(len(returns))
+    whole = m.of(moving).first.reshape(3, m.WIDTH)
+    least = m.by_group(moving, every, 0 * every, ranged=False, timed=False)[0].first.reshape(3, m.WIDTH)
+    np.testing.assert_array_equal(least[:, m.BASE], whole[:, m.BASE])
+    assert whole[:, m.RANGE].any()
+    assert whole[:, m.TIME].any()
+    assert not least[:, m.RANGE.start :].any()
+
+
 def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):
     """The derivatives carried in the moments against poses that really are later, to the square."""
     n, tau = len(returns), 0.04

@@ -1,0 +1,99 @@
+"""An estimate, and scans of the pass that is being driven, to the estimate with those scans.
+
+The passes that are closed are one sum each; a scan adds its own, and the solution goes on from the last one:
+it costs the same after a hundred returns and after a hundred million.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from polecal.calib import moments, solve
+from polecal.calib.blas import one_thread
+from polecal.calib.estimate import Pass, Result, Setup, sum_of
+from polecal.calib.geometry import Array
+from polecal.calib.moments import Moments
+from polecal.calib.observations import Kind, Mount, Returns, axis_shift_m
+from polecal.calib.solve import EXTRAS, Form, Scatter, ground_rows, pole_rows
+from polecal.calib.uncertainty import FEWEST_PASSES
+
+
+@dataclass(frozen=True, slots=True)
+class _Closed:
+    """Closed passes of one kind: returns, `Scatter.form` times them; weight and mean (108,) of one site."""
+
+    count: float
+    weight: float
+    mean: Array
+    summed: Array
+    ratio: float
+
+    @classmethod
+    def of(cls, scatter: Scatter, ratio: float, site: int) -> _Closed:
+        used = scatter.count > 0
+        count = float(scatter.count.sum())
+        return cls(
+            count,
+            *scatter.weighted_mean(used & (scatter.sites == site), ratio),
+            count * scatter.form(used, ratio),
+            ratio,
+        )
+
+    def form(self, count: float, mean: Array, within: Array) -> Array:
+        """Give what `Scatter.form` gives of all these passes and one more: its returns, mean and form."""
+        weight = count / (1.0 + count / self.ratio)
+        off = mean - self.mean
+        shared = self.weight * weight / max(self.weight + weight, 1e-300)
+        form: Array = self.summed + count * within + np.outer(shared * off, off)
+        form /= max(1.0, self.count + count)
+        return form
+
+
+class Running:
+    """Takes the scans of an open pass, of the same day as the last of the ``passes``.
+
+    What is held, and what passes weigh, stays as it was for the ``result``.
+    """
+
+    @one_thread
+    def __init__(self, passes: Sequence[Pass], setup: Setup, result: Result) -> None:
+        used = [one for one in passes if one.id not in result.set_aside]
+        self._held = {*result.held, *EXTRAS} - set(result.extras)
+        extras = [result.extras.get(name, 0.0) for name in EXTRAS]
+        self._vector = np.concatenate([result.mount.vector, extras])
+        self._shift_m = axis_shift_m(setup.pole_radius_m)
+        self._open = {kind: moments.zero() for kind in Kind}
+        self._closed: dict[Kind, _Closed] = {}
+        for kind, rows in ((Kind.POLE, pole_rows(self._vector)), (Kind.GROUND, ground_rows(self._vector))):
+            scatter = self._scatter([one.total(kind) for one in used], kind, [one.site for one in used])
+            weighed = setup.pass_error and len(used) >= FEWEST_PASSES
+            ratio = scatter.ratio(rows, scatter.count > 0) if weighed else np.inf
+            self._closed[kind] = _Closed.of(scatter, ratio, used[-1].site)
+
+    @one_thread
+    def add(self, returns: Returns) -> Mount:
+        """Add returns of the open pass, and solve again."""
+        forms = []
+        for kind, closed in self._closed.items():
+            of_kind = np.flatnonzero(returns.kind == kind)
+            blocks = moments.by_group(
+                returns,
+                of_kind,
+                np.zeros_like(of_kind),
+                ranged=kind is Kind.POLE,
+                timed="time_s" not in self._held,
+            )
+            self._open[kind] = sum_of([self._open[kind], *blocks.values()])
+            scatter, one = self._scatter([self._open[kind]], kind), np.array([True])
+            forms.append(closed.form(scatter.count[0], scatter.weighted_mean(one)[1], scatter.form(one)))
+        self._vector = solve.minimise(Form(*forms), self._vector, self._held)
+        return Mount.from_vector(self._vector[:6])
+
+    def _scatter(
+        self, of_passes: Sequence[Moments], kind: Kind, sites: Sequence[int] | None = None
+    ) -> Scatter:
+        pole = kind is Kind.POLE
+        return Scatter(of_passes, shift_m=self._shift_m if pole else 0.0, ranged=pole, sites=sites)

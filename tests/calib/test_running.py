@@ -1,0 +1,26 @@
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+
+from polecal.calib import Setup, estimate
+from polecal.calib.estimate import passes_of
+from polecal.calib.running import Running
+
+
+@pytest.mark.parametrize("extras", [frozenset(), frozenset({"range_m", "slope_north"})])
+def test_scan_by_scan_the_estimate_comes_to_that_of_all_passes(rig, extras):
+    """To Eq. 7 of all of them; it is where the estimate without the last pass is not."""
+    returns = rig.drive(noise_m=0.01, nav_m=0.02, passes=12, seed=3)
+    setup = Setup(rig.measured, pass_error=False, extras=extras)
+    last = returns.pass_id == 11
+    before = estimate(passes_of(returns[~last], 30), setup)
+    running = Running(passes_of(returns[~last], 30), setup, before)
+    driven = returns[last]
+    order = np.random.default_rng(0).permutation(len(driven))
+    for start in range(0, len(order), 401):
+        current = running.add(driven[order[start : start + 401]])
+    whole = estimate(passes_of(returns, 30), setup)
+    assert (before.held, set(before.extras)) == (whole.held, set(whole.extras))
+    assert astuple(current) == pytest.approx(astuple(whole.mount), abs=1e-6)
+    assert abs(before.mount.x_m - whole.mount.x_m) > 1e-4
