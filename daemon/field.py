@@ -29,6 +29,7 @@ from polecal.daemon.screen import Screen
 # The verbs that calculate or decode import what they need themselves: numpy takes longer than a status.
 
 _SOCKET = "/run/polecal/control.sock"
+_CONFIG = "/etc/polecal/polecal.yaml"
 _STATUS_S = 1.0
 _ANSWER_S = 10.0
 _START_S = 300.0  # a device search tries every rate, twice, and may write an EEPROM
@@ -117,6 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     export = verb(_export, "write a capture's bytes as raw serial dumps, a file a device")
     export.add_argument("capture", type=Path, metavar="CAPTURE")
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the dumps go")
+    doctor = verb(_doctor, "look for what is wrong with ports, devices, disk and clock")
+    doctor.add_argument("--config", type=Path, metavar="FILE", help=f"else $POLECAL_CONFIG, else {_CONFIG}")
     decode = verb(_decode, "print a raw byte file as JSON lines, one a frame")
     decode.add_argument("file", metavar="FILE", help="- for standard input")
     decode.add_argument("--as", dest="kind", choices=["sick_lms", "novatel_span"], required=True)
@@ -334,6 +337,26 @@ def _export(arguments: argparse.Namespace) -> int:
     for path in export_dumps(arguments.capture, arguments.out):
         print(path)
     return 0
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from polecal.daemon import config as configuration  # noqa: PLC0415
+    from polecal.daemon.doctor import as_message, examine, exit_code, in_words  # noqa: PLC0415
+
+    path = (
+        arguments.config or os.environ.get("POLECAL_CONFIG") or (_CONFIG if Path(_CONFIG).exists() else None)
+    )
+    config = configuration.load(path) if path else None
+    if sys.stderr.isatty():
+        print("looking; silent devices take up to half a minute ...", file=sys.stderr)
+    unnamed = arguments.socket == Path(_SOCKET)
+    checks = examine(config, config.socket if config is not None and unnamed else arguments.socket)
+    if arguments.json:
+        _print_json(as_message(checks))
+    else:
+        console = Console()
+        console.print(in_words(checks, console.width if console.is_terminal else None), soft_wrap=True)
+    return exit_code(checks)
 
 
 def _decode(arguments: argparse.Namespace) -> int:
