@@ -18,7 +18,16 @@ from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
 from polecal.drivers.errors import DeviceProtocolError
 from polecal.drivers.port import BITS_PER_BYTE
-from polecal.drivers.sick_lms import REVOLUTION_S, Frame, Framer, Scan, beam_ages_s, bearings_rad, decode
+from polecal.drivers.sick_lms import (
+    REVOLUTION_S,
+    Decoded,
+    Frame,
+    Framer,
+    Scan,
+    beam_ages_s,
+    bearings_rad,
+    decode,
+)
 from polecal.drivers.sick_lms.scans import ENERGY, S14, VALUES
 
 LEVELS_MODE = 0x01  # measuring mode 01: 13 bits of range, 3 of reflectivity (sheet, 3.3)
@@ -62,6 +71,8 @@ class LaserChannel:
         trajectory: Trajectory,
         gps_clock: Clock,
         on_frame: Callable[[int], None],
+        *,
+        on_scan: Callable[[int, Decoded], None] | None = None,
     ) -> None:
         self.dropped: Counter[str] = Counter()
         """Beams, or scans of a laser, that were not used, by reason."""
@@ -78,7 +89,7 @@ class LaserChannel:
         self._seen_ns = 0
         self._laser, self._pole = laser, config.pole
         self._trajectory, self._gps_clock = trajectory, gps_clock
-        self._on_frame = on_frame
+        self._on_frame, self._on_scan = on_frame, on_scan
         count = round(laser.fov_deg / laser.resolution_deg) + 1
         self._bearing_rad = bearings_rad(count, laser.fov_deg, laser.resolution_deg)
         ages_s = beam_ages_s(laser.fov_deg, laser.resolution_deg, count)
@@ -106,6 +117,8 @@ class LaserChannel:
         stx_ns = self._stx_ns(frame, scan)
         self._seen_ns = frame.t_first_ns if stx_ns is None else stx_ns
         decoded = decode(scan, LEVELS_MODE)
+        if self._on_scan is not None:
+            self._on_scan(self._seen_ns, decoded)
         found = reflectors(
             decoded.ranges_m, self._bearing_rad, decoded.reflectivity, pole_radius_m=self._pole.radius_m
         )

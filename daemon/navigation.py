@@ -9,6 +9,7 @@ faults is over only once there has been none for a while.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,9 @@ from polecal.drivers.novatel_span import (
     reference_point,
 )
 from polecal.drivers.port import BITS_PER_BYTE
+
+OnPose = Callable[[NavState, bool], None]
+"""Takes every pose that came, and whether it is used."""
 
 _RECEIVER_DRIFT = 200e-6
 _LOST_NS = 2_000_000_000  # without a pose to use for so long, it is back to aligning
@@ -145,7 +149,8 @@ class Navigation:
     Only trusted poses come into ``trajectory``, and only stamps with a known time into ``clock``.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, on_pose: OnPose | None = None) -> None:
+        self._on_pose = on_pose
         self.framer = Framer()
         self.pulse = Pulse()
         """Of the poses, used or not."""
@@ -265,9 +270,12 @@ class Navigation:
         faults = self._faults(pose, t_ns)
         if pose.good and not any(fault.kind == TIME for fault in faults):
             self.clock.update(pose.gps_ns, left_ns)
-        if self._trust.judge(t_ns, faults):
+        used = self._trust.judge(t_ns, faults)
+        if used:
             self._used_ns = t_ns
             self.trajectory.add(pose)
+        if self._on_pose is not None:
+            self._on_pose(pose, used)
 
     def _faults(self, pose: NavState, t_ns: int) -> list[Fault]:
         if not pose.good:

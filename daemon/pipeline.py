@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,18 @@ from polecal.calib.geometry import wrap
 from polecal.daemon import results
 from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.fusion import LaserChannel
-from polecal.daemon.navigation import Navigation, name_of
+from polecal.daemon.navigation import Navigation, OnPose, name_of
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.pulse import Pulse
 from polecal.daemon.routine import OnTransition, Routine, State
 from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
+from polecal.drivers.sick_lms import Decoded
 
 OnPass = Callable[[str, StoredPass], None]
 """Takes (laser's name, pass) of every pass that is closed."""
+OnScan = Callable[[str, int, Decoded], None]
+"""Takes (laser's name, host time at which its telegram began, scan) of every scan of the right variant."""
 
 _ABSURD_SIGMAS = 20.0  # off the hand measurement: of the default 0.1 m and 5 degrees, 2 m and 100 degrees
 
@@ -33,11 +37,25 @@ _ABSURD_SIGMAS = 20.0  # off the hand measurement: of the default 0.1 m and 5 de
 class _LaserRun:
     """One laser: its channel, the passes it has given, and what they come to."""
 
-    def __init__(self, config: Config, laser: Laser, trajectory: Trajectory, gps_clock: Clock) -> None:
+    def __init__(
+        self,
+        config: Config,
+        laser: Laser,
+        trajectory: Trajectory,
+        gps_clock: Clock,
+        on_scan: OnScan | None,
+    ) -> None:
         self.name = laser.name
         self.pulse = Pulse()
         self.setup = results.setup_of(config, laser)
-        self.channel = LaserChannel(laser, config, trajectory, gps_clock, self.pulse.beat)
+        self.channel = LaserChannel(
+            laser,
+            config,
+            trajectory,
+            gps_clock,
+            self.pulse.beat,
+            on_scan=partial(on_scan, laser.name) if on_scan is not None else None,
+        )
         self.result: Result | None = None
         self._passes: dict[int, list[Pass]] = {}  # by place
 
@@ -79,8 +97,8 @@ class _LaserRun:
 class Pipeline:
     """All that happens between the bytes and the verdict.
 
-    ``session`` and ``created`` go into the calibration as they are. ``on_pass`` and ``on_transition`` are
-    called from within `feed`.
+    ``session`` and ``created`` go into the calibration as they are. The callbacks are called from
+    within `feed`.
     """
 
     def __init__(
@@ -91,14 +109,16 @@ class Pipeline:
         created: str = "",
         on_pass: OnPass | None = None,
         on_transition: OnTransition | None = None,
+        on_scan: OnScan | None = None,
+        on_pose: OnPose | None = None,
     ) -> None:
         self.routine = Routine(on_transition)
         self._session, self._created = session, created
         self._on_pass = on_pass
         self._need = config.routine
-        self._navigation = Navigation(config.navigation)
+        self._navigation = Navigation(config.navigation, on_pose)
         self._lasers = {
-            laser.name: _LaserRun(config, laser, self._navigation.trajectory, self._navigation.clock)
+            laser.name: _LaserRun(config, laser, self._navigation.trajectory, self._navigation.clock, on_scan)
             for laser in config.lasers
         }
 
@@ -170,6 +190,11 @@ class Pipeline:
             "frames": laser.channel.framer.frames,
             "bad_frames": laser.channel.framer.bad_frames,
         }
+
+    def gps_ns(self, t_ns: int) -> int | None:
+        """Give the GPS time at host time ``t_ns``, None while the receiver's clock is not known."""
+        clock = self._navigation.clock
+        return clock.to_device(t_ns) if clock.locked else None
 
     def calibration(self) -> dict[str, Any] | None:
         """Give the content of ``calibration.yaml``, None before there is a result for every laser."""

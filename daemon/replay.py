@@ -31,6 +31,19 @@ class Outcome:
     accepted: bool
 
 
+def play(pipeline: Pipeline, item: recorder.Record | recorder.Event) -> None:
+    """Give a pipeline what it was given when this was recorded."""
+    if isinstance(item, recorder.Record):
+        if item.direction == "rx":
+            pipeline.feed(item.device, item.t_ns, item.data)
+    elif item.content.get("event") == BEGIN:
+        pipeline.begin(item.t_ns)
+    elif item.content.get("event") == FINISH:
+        pipeline.finish(item.t_ns, item.content["why"])
+    elif item.content.get("event") == TICK:
+        pipeline.tick(item.t_ns)
+
+
 def replay(
     capture: Path,
     config: Path | None,
@@ -67,15 +80,7 @@ def replay(
     last_ns = 0
     for number, record in enumerate(source):
         last_ns = record.t_ns
-        if isinstance(record, recorder.Record):
-            if record.direction == "rx":
-                pipeline.feed(record.device, record.t_ns, record.data)
-        elif record.content.get("event") == BEGIN:
-            pipeline.begin(record.t_ns)
-        elif record.content.get("event") == FINISH:
-            pipeline.finish(record.t_ns, record.content["why"])
-        elif record.content.get("event") == TICK:
-            pipeline.tick(record.t_ns)
+        play(pipeline, record)
         if progress is not None and number % _PROGRESS_EVERY == 0:
             progress(source.used_bytes / source.size_bytes)
     pipeline.finish(last_ns, "the capture ends here")
