@@ -97,6 +97,7 @@ class Run:
         self._unstored: list[tuple[str, StoredPass]] = []
         self._threads: list[threading.Thread] = []
         self._engine = threading.Thread(target=self._work, name="engine")
+        self._beat_s = time.monotonic()
 
     @property
     def devices(self) -> Sequence[Device]:
@@ -162,6 +163,17 @@ class Run:
         since_s = round((time.monotonic_ns() - since_ns) / 1e9, 1)
         return status | {"session": self.session.id, "since_s": since_s, "devices": devices}
 
+    def beats(self) -> dict[str, float]:
+        """Give for each thread when it last showed that it is not stuck; of those that are done, nothing."""
+        if self.ended.is_set():
+            return {}
+        readers = {
+            device.name: device.beat_s
+            for device, thread, stop in zip(self._devices, self._threads, self._stops, strict=False)
+            if thread.is_alive() or not stop.is_set()
+        }
+        return readers | {"engine": self._beat_s}
+
     def _device(self, device: Device) -> dict[str, Any]:
         problem = device.problem
         return {
@@ -187,6 +199,7 @@ class Run:
         """Record, then parse, until every device is left and nothing waits."""
         synced_s = time.monotonic()
         while any(thread.is_alive() for thread in self._threads) or not self._queue.empty():
+            self._beat_s = time.monotonic()
             try:
                 item = self._queue.get(timeout=_SYNC_S)
             except queue.Empty:

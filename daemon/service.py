@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import os
+import faulthandler
+import queue
 import re
 import signal
-import socket
 import sys
 import threading
 import time
@@ -22,11 +21,15 @@ from polecal.daemon import log, sessions
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, code_of
 from polecal.daemon.finalise import Finaliser
+from polecal.daemon.notify import Manager, summary
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.run import Run, joined, silent
 
 _START_S = 120.0  # every rate of every device tried twice, and an EEPROM written
 _LOOK_S = 0.1
+_TELL_S = 1.0
+_CLOSE_S = 60.0  # so long a disk may take to close a capture,
+_EXTEND_S = 5.0  # of which so much is asked for at a time
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")
 
 
@@ -48,7 +51,7 @@ class Service:
             case "START":
                 return self._start(request.get("name"), force=bool(request.get("force", False)))
             case "STATUS":
-                return self._status()
+                return self.status()
             case "STOP":
                 return self._stop(calibrate=bool(request.get("calibrate", False)))
             case "RESULT":
@@ -64,6 +67,37 @@ class Service:
             self._closed = True
         if self._run is not None:
             self._run.stop("the daemon is stopped")
+
+    def beats(self) -> dict[str, float]:
+        """Give for each thread of the run when it last showed that it is not stuck (CLOCK_MONOTONIC, s)."""
+        return {} if self._run is None else self._run.beats()
+
+    def reload(self, config: Config) -> list[str]:
+        """Take another configuration for the next session; give the keys that differ.
+
+        Raises Refused, where a folder would move or a run would no longer be of its configuration: then all
+        stays as it was.
+        """
+        with self._changing:
+            changed = [
+                key for key in Config.model_fields if getattr(config, key) != getattr(self._config, key)
+            ]
+            if moved := [key for key in changed if key in ("state_dir", "runtime_dir")]:
+                raise Refused(
+                    f"{' and '.join(moved)} cannot change while the daemon runs",
+                    "restart it: systemctl restart polecal",
+                    Code.CONFIG,
+                )
+            run = self._run
+            running = run is not None and not run.ended.is_set() and run.state not in ENDED
+            if run is not None and running and set(changed) - {"storage"}:
+                raise Refused(
+                    f"session {run.session.id} is running with another {', '.join(changed)}",
+                    "end it by `polecal-field stop`, then reload again",
+                    Code.BUSY,
+                )
+            self._config = config
+        return changed
 
     def _start(self, name: str | None, *, force: bool) -> dict[str, Any]:
         if name is not None and not (isinstance(name, str) and _NAME.fullmatch(name)):
@@ -124,7 +158,8 @@ class Service:
         run.stop("not all devices stream", problem=problem)
         raise problem
 
-    def _status(self) -> dict[str, Any]:
+    def status(self) -> dict[str, Any]:
+        """Give what STATUS is answered."""
         if self._run is not None:
             return {"class": "STATUS"} | self._run.status()
         devices = [
@@ -167,16 +202,17 @@ def main(argv: list[str] | None = None) -> int:
         if arguments.check_config:
             return 0
         log.configure()
-        return _serve(config)
+        return _serve(arguments.config, config)
     except PolecalError as error:
         sys.stderr.write(f"polecald: {error}\n" + (f"hint: {error.hint}\n" if error.hint else ""))
         return code_of(error)
 
 
-def _serve(config: Config) -> int:
-    stopped = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.set())
+def _serve(path: str, config: Config) -> int:
+    faulthandler.enable()  # the watchdog ends by SIGABRT: the log then has where each thread was
+    signals: queue.SimpleQueue[int] = queue.SimpleQueue()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda number, _: signals.put(number))
     for folder in (config.state_dir, config.runtime_dir):
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -186,23 +222,57 @@ def _serve(config: Config) -> int:
                 "make it, or let systemd start polecal",
                 Code.NOT_PERMITTED if isinstance(error, PermissionError) else Code.CONFIG,
             ) from error
+    manager = Manager()
     finaliser = Finaliser(config.state_dir, config.storage.min_free_mb * 1_000_000)
     service = Service(config, finaliser.add)
     with ControlServer(config.socket, service), finaliser:
         structlog.get_logger().info("ready", socket=str(config.socket), release=__version__)
-        _notify("READY=1")
-        stopped.wait()
-        _notify("STOPPING=1")
-        service.close()
+        manager.ready()
+        _attend(service, manager, signals, path)
+        manager.stopping()
+        _close(service, manager)
     return 0
 
 
-def _notify(state: str) -> None:
-    """Tell systemd, where it listens (sd_notify(3))."""
-    address = os.environ.get("NOTIFY_SOCKET")
-    if address:
-        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
-            notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+def _attend(service: Service, manager: Manager, signals: queue.SimpleQueue[int], path: str) -> None:
+    """Tell the manager how it stands, and reload on SIGHUP, until another signal comes."""
+    every_s = min(_TELL_S, (manager.watchdog_s or _TELL_S) / 4)
+    refused = ""
+    while True:
+        manager.alive(service.beats())
+        manager.status(summary(service.status()) + refused)
+        try:
+            number = signals.get(timeout=every_s)
+        except queue.Empty:
+            continue
+        if number != signal.SIGHUP:
+            return
+        manager.reloading()
+        refused = _reload(service, path)
+        manager.ready()
+
+
+def _reload(service: Service, path: str) -> str:
+    """Read the configuration again; give what to add to the status if it stays as it was."""
+    logger = structlog.get_logger()
+    try:
+        changed = service.reload(load(path))
+    except PolecalError as error:
+        logger.error("configuration not reloaded", problem=str(error), hint=error.hint)
+        return f"; configuration not reloaded: {error}"
+    logger.info("configuration reloaded", changed=", ".join(changed) or "nothing")
+    return ""
+
+
+def _close(service: Service, manager: Manager) -> None:
+    """End what runs, and ask the manager for the time that it takes."""
+    closing = threading.Thread(target=service.close, name="closing")
+    closing.start()
+    until_s = time.monotonic() + _CLOSE_S
+    while closing.is_alive():
+        if time.monotonic() < until_s:
+            manager.extend(_EXTEND_S)
+        closing.join(_TELL_S)
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ _RETRY_S = 1.0
 class Device(ABC):
     """What every device's conversation has in common; a template for `run`, which one thread calls.
 
-    Other threads may read ``state``, ``problem``, ``identity`` and ``reconnects`` at any time: each is
-    replaced as a whole.
+    Other threads may read ``state``, ``problem``, ``identity``, ``reconnects`` and ``beat_s`` at any time:
+    each is replaced as a whole.
     """
 
     kind: str
@@ -40,12 +40,17 @@ class Device(ABC):
         self.problem: DeviceError | None = None
         self.identity = ""
         self.reconnects = 0
+        self.beat_s = time.monotonic()
+        """When its thread last showed that it is not stuck, be the device there or not."""
         self._tap = tap
         self._log = structlog.get_logger().bind(device=name, port=path)
 
     def open(self, stop: threading.Event) -> Port:
         """Open the port. Raises DeviceError."""
-        return Port(self.path, self.baud, self._tap, stop)
+        return Port(self.path, self.baud, self._tap, stop, self._beat)
+
+    def _beat(self) -> None:
+        self.beat_s = time.monotonic()
 
     def run(self, port: Port) -> None:
         """Keep the device streaming until the port's ``stop`` is set, then leave it polite.
@@ -63,6 +68,7 @@ class Device(ABC):
             except DeviceError as error:
                 self._trouble(error)
             while not stop.wait(_RETRY_S):
+                self._beat()
                 try:
                     port = self.open(stop)
                     break

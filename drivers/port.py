@@ -54,16 +54,28 @@ class Chunk:
 def _no_tap(direction: Direction, t_ns: int, data: bytes) -> None: ...
 
 
+def _no_beat() -> None: ...
+
+
 class Port:
     """One serial line, opened for this process alone.
 
     ``stop``, once set, makes the next ``read`` raise `Stopped`; clear it to say goodbye to the device.
+    ``beat`` is called several times a second while somebody reads, also in a silence.
     """
 
-    def __init__(self, path: str, baud: int, tap: Tap = _no_tap, stop: threading.Event | None = None) -> None:
+    def __init__(
+        self,
+        path: str,
+        baud: int,
+        tap: Tap = _no_tap,
+        stop: threading.Event | None = None,
+        beat: Callable[[], None] = _no_beat,
+    ) -> None:
         self.path = path
         self.stop = stop or threading.Event()
         self._tap = tap
+        self._beat = beat
         try:
             self._serial = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, termios.error, ValueError) as error:
@@ -110,6 +122,7 @@ class Port:
         """
         deadline_s = time.monotonic() + timeout_s
         while True:
+            self._beat()
             if self.stop.is_set():
                 raise Stopped
             left_s = max(0.0, deadline_s - time.monotonic())

@@ -1,6 +1,7 @@
 """What the daemon answers, on pseudo-terminals and in a process of its own."""
 
 import fcntl
+import json
 import os
 import signal
 import threading
@@ -264,7 +265,67 @@ def test_a_device_that_does_not_stream_in_time_is_named(lonely, bench, monkeypat
     daemon.close()
 
 
+# --- another configuration
+
+
+def test_another_configuration_is_taken_for_the_next_session(daemon, bench):
+    bench.content["pole"] = {"radius_m": 0.05, "height_m": 2.4}
+    assert daemon.reload(bench.config) == ["pole"]
+    assert daemon.reload(bench.config) == []
+    session = ask(daemon, "START", name=None)["session"]
+    told = (bench.config.state_dir / "sessions" / session / "session.yaml").read_text()
+    assert "radius_m: 0.05" in told
+
+    bench.content["pole"] = {"radius_m": 0.03, "height_m": 2.4}
+    bench.content["accept"] = {"cost_m": 1.0}
+    with pytest.raises(Refused, match=f"{session} is running with another pole, accept") as caught:
+        daemon.reload(bench.config)
+    assert caught.value.code == Code.BUSY
+    assert "polecal-field stop" in caught.value.hint
+    ask(daemon, "STOP")
+    assert daemon.reload(bench.config) == ["pole", "accept"]
+
+
+def test_while_a_session_is_running_what_is_none_of_its_business_may_change(daemon, bench):
+    ask(daemon, "START", name=None)
+    bench.content["storage"] = {"min_free_mb": 1}
+    assert daemon.reload(bench.config) == ["storage"]
+
+
+@pytest.mark.parametrize("key", ["state_dir", "runtime_dir"])
+def test_a_folder_cannot_move_under_a_daemon(daemon, bench, key, tmp_path):
+    bench.content[key] = str(tmp_path / "elsewhere")
+    with pytest.raises(Refused, match=f"{key} cannot change") as caught:
+        daemon.reload(bench.config)
+    assert "systemctl restart" in caught.value.hint
+    assert not (tmp_path / "elsewhere").exists()
+
+
 # --- a process of its own
+
+
+def test_on_sighup_the_file_is_read_again_whole_or_all_stays_as_it_was(bench, running, until):
+    with running(bench) as daemon:
+        logged = bench.folder / "polecald.log"
+
+        def reload(expected):
+            before = len(logged.read_text().splitlines())
+            bench.config_file.write_text(text)
+            daemon.send_signal(signal.SIGHUP)
+            lines = until(lambda: [json.loads(line) for line in logged.read_text().splitlines()[before:]])
+            until(lambda: expected in logged.read_text().splitlines()[before])
+            return lines[0]
+
+        good = bench.config_file.read_text()
+        text = good.replace("radius_m: 0.04", "radius_m: -0.04") + "poles: 2\n"
+        said = reload("configuration not reloaded")
+        assert "pole.radius_m" in said["problem"]
+        assert "poles: is not a key" in said["problem"]
+        text = good.replace("radius_m: 0.04", "radius_m: 0.05")
+        assert reload("configuration reloaded")["changed"] == "pole"
+        assert daemon.poll() is None
+        told = (start(bench) / "session.yaml").read_text()
+        assert "radius_m: 0.05" in told
 
 
 def start(bench):

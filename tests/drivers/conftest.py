@@ -118,7 +118,9 @@ def connected(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Callable[[Peer],
     """Put a peer at the end of every port that is opened."""
 
     def make(peer: Peer) -> None:
-        def port(path: str, baud: int, tap: Tap, stop: threading.Event) -> VirtualPort:
+        def port(
+            path: str, baud: int, tap: Tap, stop: threading.Event, beat: Callable[[], None]
+        ) -> VirtualPort:
             return VirtualPort(clock, peer, baud, tap, stop)
 
         monkeypatch.setattr("polecal.drivers.device.Port", port)
