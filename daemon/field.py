@@ -246,8 +246,10 @@ def _stop(arguments: argparse.Namespace) -> int:
         _print_json(answer)
     else:
         print(f"session {answer.get('session')} has ended: {answer.get('state')}")
-    state = answer.get("state")
-    return _EXIT_BY_STATE[state] if arguments.calibrate and state in _EXIT_BY_STATE else 0
+    for note in answer.get("notes", []):
+        _complain(note, "see `polecal-field status`")
+    state, done = answer.get("state"), Code.DEGRADED if answer.get("notes") else 0
+    return (_EXIT_BY_STATE[state] if arguments.calibrate and state in _EXIT_BY_STATE else 0) or done
 
 
 def _result(arguments: argparse.Namespace) -> int:

@@ -102,6 +102,18 @@ class Recorder:
         """How much is in the file."""
         return self._file.tell()
 
+    @property
+    def closed(self) -> bool:
+        """Whether nothing can be written any more."""
+        return self._file.closed
+
+    def add(self, item: Record | Event) -> None:
+        """Record a chunk or an event. Raises RecorderError, as `write` does."""
+        if isinstance(item, Record):
+            self.write(item.device, item.direction, item.t_ns, item.data)
+        else:
+            self.event(item.t_ns, item.content)
+
     def write(self, device: str, direction: Direction, t_ns: int, data: bytes) -> None:
         """Record a chunk. Raises RecorderError: this chunk is lost, the file is whole."""
         self._message(f"/{device}/{direction}", RAW, t_ns, data)
@@ -129,6 +141,16 @@ class Recorder:
         """Wait until all that was written is on the disk; writers need not wait. Raises RecorderError."""
         with self._syncing:
             self._file.sync()
+
+    def abandon(self) -> None:
+        """End the capture behind its last whole message, as a kill would, for good. Raises RecorderError."""
+        with self._lock, self._syncing:
+            if self._file.closed:
+                return
+            try:
+                self._file.sync()
+            finally:
+                self._file.close()
 
     def close(self) -> None:
         """Write the summary and close the file, which a full disk leaves cut off. Raises RecorderError."""

@@ -1,9 +1,8 @@
-"""One calibration run: device threads to one thread that records each chunk and then feeds the pipeline."""
+"""One calibration run: device threads to a thread that records each chunk, and one that then hears it."""
 
 from __future__ import annotations
 
 import contextlib
-import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -17,30 +16,28 @@ from polecal import PolecalError
 from polecal.daemon.config import SPAN, Config
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.pipeline import Pipeline
-from polecal.daemon.recorder import FULL, DiskFull, Recorder, RecorderError
-from polecal.daemon.replay import BEGIN, FINISH, TICK
+from polecal.daemon.recorder import FULL, DiskFull, Event, Record, Recorder, RecorderError
+from polecal.daemon.replay import BEGIN, FINISH, play
 from polecal.daemon.routine import ENDED, State
-from polecal.daemon.sessions import Session, SessionError
-from polecal.daemon.space import Space
+from polecal.daemon.sessions import CALIBRATION, Session, SessionError
+from polecal.daemon.space import MAKE_ROOM, Space
+from polecal.daemon.writer import Writer
 from polecal.drivers.device import Device
 from polecal.drivers.errors import DeviceError, DeviceProtocolError
 from polecal.drivers.novatel_span import NovatelSpan
 from polecal.drivers.port import Direction, Port, Tap
 from polecal.drivers.sick_lms import SickLms
 
-_QUEUED_CHUNKS = 50_000  # minutes of both devices: a disk that stalls for longer stalls the readers
-_SYNC_S = 0.5  # what is written may wait for so long again, in a silence: a power cut takes 1 s at most
-_MAKE_ROOM = "make room on the disk: what is known is kept, and recording goes on"
-
-_Chunk = tuple[str, Direction, int, bytes]
+_LOOK_S = 0.5
+_PATIENCE_S = 0.3  # a status waits no longer for one that is being calculated
+_WRITE_AGAIN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class _End:
-    """Asks the engine to end the run: with what there is calibrated, as a fault, or just so."""
+    """Asks the engine to end the run without a result: as a fault, or just so."""
 
     why: str
-    calibrate: bool = False
     problem: PolecalError | None = None
 
 
@@ -57,7 +54,6 @@ class Run:
         """Set once the devices are left, the capture is closed and the result is written."""
         self._log = structlog.get_logger().bind(session=session.id)
         self._lock = threading.Lock()
-        self._queue: queue.Queue[_Chunk | _End] = queue.Queue(_QUEUED_CHUNKS)
         self._problem: PolecalError | None = None
         self._pipeline = Pipeline(
             config,
@@ -88,13 +84,13 @@ class Run:
             ),
         ]
         self._recorder = Recorder(session.capture, session.metadata(config))
+        self._space = Space(config.state_dir, config.storage)
+        self._writer = Writer(self._recorder, self._space, session.id)
         self._stops = [threading.Event() for _ in self._devices]
         self._leaving = False
-        self._space = Space(config.state_dir, config.storage)
-        self._full: str | None = None  # why nothing is recorded
-        self._owed: _Chunk | None = None  # the first chunk without room: the recorder keeps it
-        self._missed = 0
-        self._unstored: list[tuple[str, StoredPass]] = []
+        self._unwritten: list[tuple[str, Callable[[], object]]] = []  # what there was no room for
+        self._write_again_s = 0.0
+        self._known = self._know()
         self._threads: list[threading.Thread] = []
         self._engine = threading.Thread(target=self._work, name="engine")
         self._beat_s = time.monotonic()
@@ -132,9 +128,6 @@ class Run:
                     problems.append(error)
             if problems:
                 raise joined(problems)
-            self._full = self._space.make_room(self.session.id)
-            if self._full is not None:
-                raise DiskFull(f"{self.session.folder}: {self._full}", _MAKE_ROOM)
             now_ns = time.monotonic_ns()
             self._recorder.event(now_ns, {"event": BEGIN})
             with self._lock:
@@ -142,26 +135,49 @@ class Run:
             undo.pop_all()
         for device, port in zip(self._devices, ports, strict=True):
             self._threads.append(threading.Thread(target=device.run, args=(port,), name=device.name))
+        self._writer.start()
         for thread in (*self._threads, self._engine):
             thread.start()
 
     def stop(self, why: str, *, calibrate: bool = False, problem: PolecalError | None = None) -> None:
         """End the run, also as a fault or with what there is calibrated; returns once all is closed."""
-        self._queue.put(_End(why, calibrate, problem))
+        if not self.ended.is_set():
+            finish = Event(time.monotonic_ns(), {"event": FINISH, "why": why})
+            self._writer.put(finish if calibrate and problem is None else _End(why, problem))
         self.ended.wait()
 
     def status(self) -> dict[str, Any]:
-        """Give the parts of STATUS that a run knows."""
-        with self._lock:
-            status = self._pipeline.status()
-            since_ns = self._pipeline.routine.since_ns
-            devices = [self._device(device) for device in self._devices]
-        if self._problem is not None:
-            status["notes"] = [str(self._problem), *status["notes"]]
-        if self._full is not None:
-            status["notes"] = [f"nothing is recorded: {self._full}; {_MAKE_ROOM}", *status["notes"]]
+        """Give the parts of STATUS that a run knows; while it calculates, those from before."""
+        if self._lock.acquire(timeout=_PATIENCE_S):
+            try:
+                self._known = self._know()
+            finally:
+                self._lock.release()
+        status, since_ns, heard = self._known
         since_s = round((time.monotonic_ns() - since_ns) / 1e9, 1)
-        return status | {"session": self.session.id, "since_s": since_s, "devices": devices}
+        return status | {
+            "session": self.session.id,
+            "since_s": since_s,
+            "devices": [self._device(device, heard[device.name]) for device in self._devices],
+            "notes": [*self.notes, *status["notes"]],
+        }
+
+    @property
+    def notes(self) -> list[str]:
+        """What is wrong with the run, in plain words."""
+        notes = [] if self._problem is None else [str(self._problem)]
+        if self._writer.full is not None and not self.ended.is_set():
+            notes.append(f"nothing is recorded: {self._writer.full}; {MAKE_ROOM}")
+        if self._space.over is not None:
+            notes.append(self._space.over)
+        if names := [name for name, _ in self._unwritten]:
+            notes.append(f"for want of room not written: {', '.join(names)}; they are once there is room")
+        return notes
+
+    def _know(self) -> tuple[dict[str, Any], int, dict[str, dict[str, Any]]]:
+        """Give what the pipeline says: its status, since when it is in its state, and of each device."""
+        heard = {device.name: self._pipeline.device(device.name) for device in self._devices}
+        return self._pipeline.status(), self._pipeline.routine.since_ns, heard
 
     def beats(self) -> dict[str, float]:
         """Give for each thread when it last showed that it is not stuck; of those that are done, nothing."""
@@ -172,9 +188,9 @@ class Run:
             for device, thread, stop in zip(self._devices, self._threads, self._stops, strict=False)
             if thread.is_alive() or not stop.is_set()
         }
-        return readers | {"engine": self._beat_s}
+        return readers | {"engine": self._beat_s, "writer": self._writer.beat_s}
 
-    def _device(self, device: Device) -> dict[str, Any]:
+    def _device(self, device: Device, heard: dict[str, Any]) -> dict[str, Any]:
         problem = device.problem
         return {
             "name": device.name,
@@ -182,7 +198,7 @@ class Run:
             "port": device.path,
             "state": device.state,
             "identity": device.identity,
-            **self._pipeline.device(device.name),
+            **heard,
             **({} if device.state == "streaming" else {"rate_hz": 0.0}),
             "reconnects": device.reconnects,
             **device.about(),
@@ -191,146 +207,117 @@ class Run:
 
     def _tap(self, name: str) -> Tap:
         def tap(direction: Direction, t_ns: int, data: bytes) -> None:
-            self._queue.put((name, direction, t_ns, data))
+            self._writer.put(Record(name, direction, t_ns, data))
 
         return tap
 
     def _work(self) -> None:
-        """Record, then parse, until every device is left and nothing waits."""
-        synced_s = time.monotonic()
-        while any(thread.is_alive() for thread in self._threads) or not self._queue.empty():
+        """Hear what was recorded until every device is left, and nothing waits."""
+        while any(thread.is_alive() for thread in self._threads):
             self._beat_s = time.monotonic()
-            try:
-                item = self._queue.get(timeout=_SYNC_S)
-            except queue.Empty:
-                item = None
-            try:
-                if item is not None:
-                    self._take(item)
-                elif self._pipeline.routine.running and self._full is None:
-                    self._tick()
-                if time.monotonic() - synced_s >= _SYNC_S:
-                    synced_s = time.monotonic()
-                    self._look_at_disk()
-                    self._recorder.sync()
-            except DiskFull as error:
-                self._pause(str(error))
-            except PolecalError as error:
-                self._fail(error)
-            except Exception as error:  # a bug: what comes in is still recorded, and the devices are left
-                self._log.exception("bug")
-                self._fail(
-                    PolecalError(f"a bug in polecal: {error!r}", "report it with the session's folder")
-                )
-            if self.state in ENDED:
-                self._leave()
-        self._close()
-
-    def _take(self, item: _Chunk | _End) -> None:
-        if isinstance(item, _End):
-            self._end(item)
-            return
-        if self._full is not None:
-            self._missed += 1
-            return
+            self._do(self._writer.get(_LOOK_S))
         try:
-            self._recorder.write(*item)
-        except DiskFull as error:
-            self._owed = item
-            self._pause(str(error))
-        else:
-            self._hear(item)
+            self._writer.close()
+        except DiskFull as error:  # it is cut off, and repaired at the daemon's next start
+            self._log.warning("capture cut off", problem=str(error), hint=error.hint)
+        except RecorderError as error:
+            self._fail(error)
+        while (item := self._writer.get(0.0)) is not None:
+            self._do(item)
+        if self._unwritten:
+            threading.Thread(target=self._write_late, name="late", daemon=True).start()
+        self.ended.set()
+        if self._on_closed is not None:
+            self._on_closed(self.session.capture)
 
-    def _hear(self, chunk: _Chunk) -> None:
-        """Feed the pipeline what is in the capture, and nothing else."""
-        name, direction, t_ns, data = chunk
-        if direction == "rx" and self._problem is None and self._pipeline.routine.running:
-            with self._lock:
-                self._pipeline.feed(name, t_ns, data)
-                self._write_result()
+    def _do(self, item: object | None) -> None:
+        try:
+            match item:
+                case Record() | Event():
+                    self._hear(item)
+                case _End():
+                    self._end(item)
+                case PolecalError():
+                    self._fail(item)
+            if self._unwritten and time.monotonic() >= self._write_again_s:
+                self._write()
+        except PolecalError as error:
+            self._fail(error)
+        except Exception as error:  # a bug: what comes in is still recorded, and the devices are left
+            self._log.exception("bug")
+            self._fail(PolecalError(f"a bug in polecal: {error!r}", "report it with the session's folder"))
+        if self.state in ENDED:
+            self._leave()
 
-    def _look_at_disk(self) -> None:
-        """Stop to record while there is too little room, and go on once there is enough."""
-        if self._full is None:
-            if self._space.lacking() and (why := self._space.make_room(self.session.id)):
-                self._pause(why)
-        elif self._space.make_room(self.session.id) is None:
-            self._recorder.settle()
-            owed, self._owed = self._owed, None
-            missed, self._missed = self._missed, 0
-            self._full = None
-            self._store_passes()
-            self._log.info("recording goes on", missed_chunks=missed)
-            if owed is not None:
-                self._hear(owed)
-            self._recorder.event(time.monotonic_ns(), {"event": "recording goes on", "missed_chunks": missed})
-
-    def _pause(self, why: str) -> None:
-        if self._full is None:
-            self._log.error("disk full", problem=why, hint=_MAKE_ROOM)
-            with contextlib.suppress(DiskFull):
-                self._recorder.event(time.monotonic_ns(), {"event": "disk full", "why": why})
-        self._full = why
-
-    def _tick(self) -> None:
-        """Let the pipeline know that time goes on, though nothing comes: an input, so it is recorded."""
-        now_ns = time.monotonic_ns()
-        self._recorder.event(now_ns, {"event": TICK})
+    def _hear(self, item: Record | Event) -> None:
+        """Let the pipeline hear what is in the capture, and nothing else."""
+        if self._problem is not None or not self._pipeline.routine.running:
+            return
         with self._lock:
-            self._pipeline.tick(now_ns)
+            if isinstance(item, Event):
+                self._known = self._know()  # what it asks for may take a while
+            play(self._pipeline, item)
+            if self.state in (State.ACCEPTED, State.REJECTED):
+                self._keep_result()
 
     def _end(self, end: _End) -> None:
         if end.problem is not None:
             self._fail(end.problem)
-        elif end.calibrate:
-            now_ns = time.monotonic_ns()
-            self._recorder.event(now_ns, {"event": FINISH, "why": end.why})
-            with self._lock:
-                self._pipeline.finish(now_ns, end.why)
-                self._write_result()
         elif self._pipeline.routine.running:
             self._pipeline.routine.to(State.IDLE, time.monotonic_ns(), end.why)
 
-    def _write_result(self) -> None:
+    def _keep_result(self) -> None:
         """Write the result of a run that has just ended, before anybody can see that it has."""
-        calibration = self._pipeline.calibration() if self.state in (State.ACCEPTED, State.REJECTED) else None
+        calibration = self._pipeline.calibration()
         if calibration is not None:
-            self.session.write_calibration(calibration)
+            self._unwritten.append((CALIBRATION, lambda: self.session.write_calibration(calibration)))
+            self._write()
 
     def _store(self, laser: str, stored: StoredPass) -> None:
-        """Write a pass before anybody can see that it is closed."""
-        self._unstored.append((laser, stored))
-        self._store_passes()
+        """Write a pass, once it is sure that what it is made of is on the disk, before anybody can see it."""
+        self._known = self._know()
+        self._unwritten.append(
+            (f"pass {stored.id} of {laser}", lambda: self.session.write_pass(laser, stored))
+        )
+        self._write()
+        self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
 
-    def _store_passes(self) -> None:
-        """Write the passes that are closed; for which there is no room, those are kept until there is."""
+    def _write(self) -> None:
+        """Write passes and the result; those for which there is no room are kept until there is."""
         try:
-            while self._unstored:
-                laser, stored = self._unstored[0]
-                self._recorder.sync()
-                self.session.write_pass(laser, stored)
-                self._unstored.pop(0)
-                self._log.info("pass", laser=laser, id=stored.id, returns=len(stored.returns))
-        except DiskFull as error:
-            self._pause(str(error))
-        except SessionError as error:
-            if not (isinstance(error.__cause__, OSError) and error.__cause__.errno in FULL):
+            self._writer.sync()
+            while self._unwritten:
+                self._unwritten[0][1]()
+                self._unwritten.pop(0)
+            self._write_again_s = 0.0
+        except (DiskFull, SessionError) as error:
+            full = isinstance(error, DiskFull) or getattr(error.__cause__, "errno", None) in FULL
+            if not full:
                 raise
-            self._pause(str(error))
+            if not self._write_again_s:  # each second again
+                self._log.error("not written", problem=str(error), hint=MAKE_ROOM)
+            self._write_again_s = time.monotonic() + _WRITE_AGAIN_S
+
+    def _write_late(self) -> None:
+        """Go on trying to write what the end of the run left in memory."""
+        again = threading.Event()
+        while self._unwritten:
+            again.wait(_WRITE_AGAIN_S)
+            try:
+                self._write()
+            except PolecalError as error:
+                self._log.error("never written", problem=str(error), hint=error.hint)
+                return
 
     def _on_transition(self, t_ns: int, old: State, new: State, why: str) -> None:
         self._log.info("state", old=str(old), new=str(new), why=why)
-        try:
-            self._recorder.event(t_ns, {"event": "state", "old": old, "new": new, "why": why})
-        except DiskFull as error:  # not through the pipeline, which is in the midst of a chunk
-            self._pause(str(error))
+        self._writer.note(Event(t_ns, {"event": "state", "old": old, "new": new, "why": why}))
 
     def _fail(self, error: PolecalError) -> None:
         if self._problem is None:
             self._log.error("run failed", problem=str(error), hint=error.hint)
             self._problem = error
-            with contextlib.suppress(RecorderError):  # which may be what failed
-                self._pipeline.routine.to(State.FAULT, time.monotonic_ns(), str(error))
+            self._pipeline.routine.to(State.FAULT, time.monotonic_ns(), str(error))
         self._leave()
 
     def _leave(self) -> None:
@@ -340,15 +327,6 @@ class Run:
         if not leaving:
             for stop in self._stops:
                 stop.set()
-
-    def _close(self) -> None:
-        try:
-            self._recorder.close()
-        except RecorderError as error:
-            self._fail(error)
-        self.ended.set()
-        if self._on_closed is not None:
-            self._on_closed(self.session.capture)
 
 
 def joined(problems: Sequence[DeviceError]) -> DeviceError:

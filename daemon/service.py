@@ -24,6 +24,7 @@ from polecal.daemon.finalise import Finaliser
 from polecal.daemon.notify import Manager, summary
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.run import Run, joined, silent
+from polecal.daemon.space import Space
 
 _START_S = 120.0  # every rate of every device tried twice, and an EEPROM written
 _LOOK_S = 0.1
@@ -128,6 +129,7 @@ class Service:
         with self._changing:
             if self._closed:
                 raise Refused("the daemon is being stopped", "start it again first", Code.BUSY)
+            Space(self._config.state_dir, self._config.storage).require()
             session = sessions.create(self._config.state_dir, self._config, name)
             run = Run(self._config, session, self._on_closed)
             try:
@@ -184,7 +186,8 @@ class Service:
         if self._run is None or self._run.ended.is_set():
             raise Refused("no session is running", "start one by `polecal-field start`", Code.USAGE)
         self._run.stop("asked to stop", calibrate=calibrate)
-        return {"class": "STOPPED", "session": self._run.session.id, "state": str(self._run.state)}
+        answer = {"class": "STOPPED", "session": self._run.session.id, "state": str(self._run.state)}
+        return answer | ({"notes": self._run.notes} if self._run.notes else {})
 
     def _result(self, session: str | None) -> dict[str, Any]:
         return {"class": "RESULT"} | sessions.calibration_of(self._config.state_dir, session)

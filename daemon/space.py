@@ -10,15 +10,25 @@ import structlog
 import yaml
 
 from polecal.daemon.config import Storage
+from polecal.daemon.recorder import DiskFull
 from polecal.daemon.sessions import CALIBRATION
+
+MAKE_ROOM = "make room on the disk: what is known is kept, and recording goes on"
 
 _MB = 1_000_000
 
 
 class Space:
-    """How much room the sessions may take, and how much they must leave."""
+    """How much room the sessions may take, and how much they must leave.
+
+    The floor is kept: below it nothing is recorded. A quota is only aimed at: where what may not be removed
+    takes more, the running session too, that is told and recording goes on, as a drive cannot be repeated
+    so easily as a disk can be cleared.
+    """
 
     def __init__(self, state_dir: Path, storage: Storage) -> None:
+        self.over: str | None = None
+        """By how much the quota is exceeded, though all that may go has gone; as of the last look."""
         self._sessions = state_dir / "sessions"
         self._storage = storage
         self._log = structlog.get_logger()
@@ -35,7 +45,15 @@ class Space:
             return None
         return f"only {free / _MB:.0f} MB are free on the disk, of {self._storage.min_free_mb} that must be"
 
-    def make_room(self, running: str) -> str | None:
+    def require(self) -> None:
+        """Make room for a new session. Raises DiskFull if there is too little even so."""
+        if (why := self.make_room(None)) is not None:
+            raise DiskFull(
+                f"{self._sessions}: {why}; no session is left that was not accepted",
+                "make room on the disk, or move accepted sessions away; then start again",
+            )
+
+    def make_room(self, running: str | None) -> str | None:
         """Remove sessions as long as there is too little room; say so if there still is, as `lacking` does.
 
         The oldest go first; never ``running``, nor one that was accepted.
@@ -53,10 +71,21 @@ class Space:
                 self._log.error("session cannot be removed", session=path.name)
             else:
                 self._log.warning("session removed for room", session=path.name, size_bytes=sizes.pop(path))
+        taken_mb = sum(sizes.values()) / _MB
+        if quota is None or taken_mb <= quota:
+            self.over = None
+        else:
+            if self.over is None:
+                self._log.warning("quota exceeded", taken_mb=round(taken_mb), quota_mb=quota)
+            self.over = (
+                f"sessions take {taken_mb:.0f} MB, of {quota} that they may: move accepted ones away, "
+                "which are never removed"
+            )
         return self.lacking()
 
     def _free_bytes(self) -> int:
-        return shutil.disk_usage(self._sessions.parent).free
+        there = next(path for path in self._sessions.parents if path.exists())  # it is made by the first
+        return shutil.disk_usage(there).free
 
 
 def _size(folder: Path) -> int:

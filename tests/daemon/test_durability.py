@@ -26,7 +26,7 @@ from pathlib import Path
 from polecal.daemon import recorder, run as running, sessions
 from polecal.daemon.config import loads
 
-folder, delays_s, at_once, pause_s = Path(sys.argv[1]), *map(json.loads, sys.argv[2:])
+folder, moments, at_once, pause_s = Path(sys.argv[1]), *map(json.loads, sys.argv[2:])
 config = loads((folder / "polecal.yaml").read_text())
 chunks = pickle.loads((folder / "chunks").read_bytes())
 taps = {}
@@ -95,8 +95,8 @@ def begin(n):
     one.ended.wait()
     os._exit(1)
 
-for first in range(0, len(delays_s), at_once):
-    part = range(first, min(first + at_once, len(delays_s)))
+for first in range(0, len(moments), at_once):
+    part = range(first, min(first + at_once, len(moments)))
     children = {begin(n): n for n in part}
     due = {}
     while children:
@@ -104,8 +104,9 @@ for first in range(0, len(delays_s), at_once):
             if os.waitpid(child, os.WNOHANG) != (0, 0):
                 sys.exit(f"run {n} has ended by itself")
             path = folder / f"told-{n:02d}"
-            if child not in due and path.exists() and b"wrote" in path.read_bytes():
-                due[child] = time.monotonic() + delays_s[n]
+            after, delay_s = moments[n]
+            if child not in due and path.exists() and f'["{after}"'.encode() in path.read_bytes():
+                due[child] = time.monotonic() + delay_s
             if child in due and time.monotonic() > due[child]:
                 os.kill(child, signal.SIGKILL)
                 assert os.waitpid(child, 0)[1] == signal.SIGKILL
@@ -132,9 +133,9 @@ class Told:
 
 @pytest.fixture
 def killed(recorded, drive, settings, tmp_path):
-    """Begins the daemon's run again and again, and kills each so many seconds after its first message."""
+    """Begins the daemon's run again and again, and kills each so many seconds after what it told first."""
 
-    def kill(delays_s, *, at_once, pause_s):
+    def kill(moments, *, at_once, pause_s):
         config = settings(state_dir=str(tmp_path / "state"), routine={"min_passes": 99})
         (tmp_path / "polecal.yaml").write_text(dump(config))
         first_ns = recorded.played.passes[0][1].t_ns[0] - 4 * 10**9
@@ -143,7 +144,7 @@ def killed(recorded, drive, settings, tmp_path):
         )
         (tmp_path / "inodes").mkdir()
         command = [sys.executable, "-W", "error", "-c", RUNS, str(tmp_path)]
-        how = [json.dumps(value) for value in (delays_s, at_once, pause_s)]
+        how = [json.dumps(value) for value in (moments, at_once, pause_s)]
         done = subprocess.run([*command, *how], capture_output=True, timeout=50, check=False)
         assert done.returncode == 0, done.stderr.decode()
         return [Told(path) for path in sorted(tmp_path.glob("told-*"))]
@@ -157,8 +158,8 @@ def records(capture):
 
 def test_fifty_kills_lose_no_message_and_no_pass_and_every_session_is_repaired(killed, tell):
     rng = random.Random(7)
-    delays_s = [rng.uniform(1.8, 2.4) for _ in range(8)] + [rng.uniform(0, 0.5) for _ in range(KILLS - 8)]
-    runs = killed(delays_s, at_once=4, pause_s=0.0)
+    moments = [("pass" if n < 8 else "wrote", rng.uniform(0, 0.5)) for n in range(KILLS)]
+    runs = killed(moments, at_once=4, pause_s=0.0)
     assert len(runs) == KILLS
     for run in runs:
         path = run.folder / "capture.mcap"
@@ -198,7 +199,7 @@ def on_disk(run, inodes):
 
 
 def test_a_power_cut_loses_a_second_at_most_and_no_pass_and_leaves_nothing_corrupt(killed, tmp_path, tell):
-    runs = killed([0.6, 1.1, 1.7, 2.4], at_once=4, pause_s=0.02)
+    runs = killed([("wrote", 0.6), ("wrote", 1.1), ("pass", 0.3), ("pass", 0.9)], at_once=4, pause_s=0.02)
     worst_s = passes = 0
     for run in runs:
         files = on_disk(run, tmp_path / "inodes")

@@ -1,5 +1,6 @@
 """A run on pseudo-terminals, in real time: what it records, what it survives, how it leaves."""
 
+import threading
 import time
 
 import numpy as np
@@ -163,10 +164,10 @@ def test_a_full_disk_stops_recording_keeps_all_that_is_known_and_goes_on_when_th
     until(lambda: any("nothing is recorded" in note for note in run.status()["notes"]))
     assert run.state is State.COLLECTING
     assert run.status()["lasers"][0]["estimate"] is not None
-    until(lambda: run._missed > 20)
+    until(lambda: run._writer.missed > 20)
     assert states(run) == STREAMING
     (disk / "filler").unlink()
-    until(lambda: run._full is None)
+    until(lambda: run._writer.full is None)
     heard = run.status()["devices"][0]["frames"]
     until(lambda: run.status()["devices"][0]["frames"] > heard)
     run.stop("asked to stop", calibrate=True)
@@ -239,3 +240,43 @@ def test_stopping_does_not_wait_for_devices_that_are_gone(bench, begin, until):
     run.stop("asked to stop")
     assert time.monotonic() - since_s < 10.0
     assert run.state is State.IDLE
+
+
+def test_an_end_on_a_full_disk_is_no_fault_and_its_result_is_written_once_there_is_room(
+    bench, begin, until, small_disk
+):
+    disk = small_disk("24m")
+    run = begin(bench, state_dir=disk, storage=Storage(min_free_mb=1))
+    until(lambda: run.status()["lasers"][0]["passes"] == 1)
+    with pytest.raises(OSError, match="No space"):
+        fill(disk / "filler")
+    until(lambda: run._writer.full is not None)
+    run.stop("asked to stop", calibrate=True)
+    assert run.state is State.REJECTED
+    status = run.status()
+    assert status["lasers"][0]["estimate"] is not None
+    assert f"not written: {CALIBRATION}" in status["notes"][0]
+    written = run.session.folder / CALIBRATION
+    assert not written.exists()
+    (disk / "filler").unlink()
+    until(written.exists)
+    until(lambda: not run.notes)
+    outcome = replay(run.session.capture, None, bench.folder / "out", None)
+    assert (outcome.out / CALIBRATION).read_bytes() == written.read_bytes()
+
+
+def test_status_answers_while_a_pass_waits_for_the_disk(bench, begin, until, monkeypatch):
+    run = begin(bench)
+    waiting, go = threading.Event(), threading.Event()
+
+    def slow():
+        waiting.set()
+        assert go.wait(10.0)
+
+    monkeypatch.setattr(run._writer, "sync", slow)
+    assert waiting.wait(15.0)
+    since_s = time.monotonic()
+    assert run.status()["lasers"][0]["passes"] == 0  # nobody sees it before it is on the disk
+    assert time.monotonic() - since_s < 1.0
+    go.set()
+    until(lambda: run.status()["lasers"][0]["passes"] == 1)

@@ -1,5 +1,6 @@
 """Room on the disk: the oldest sessions go that were not accepted, and no other."""
 
+import shutil
 from contextlib import suppress
 
 import pytest
@@ -8,8 +9,11 @@ from structlog.testing import capture_logs
 
 from polecal.daemon import sessions
 from polecal.daemon.config import ConfigError, Storage
+from polecal.daemon.recorder import DiskFull
 from polecal.daemon.run import Run
+from polecal.daemon.service import Service
 from polecal.daemon.space import Space
+from polecal.drivers.errors import DeviceNotFound
 
 MB = 1_000_000
 STATES = {"1-old": None, "2-accepted": "accepted", "3-rejected": "rejected", "4-odd": "", "5-now": None}
@@ -68,21 +72,65 @@ def test_what_makes_no_sense_is_a_fault(settings):
     assert settings(storage={"quota_mb": 5000}).storage == Storage(min_free_mb=200, quota_mb=5000)
 
 
+def fill(disk):
+    """Leave no room at all."""
+    with (disk / "filler").open("wb", buffering=0) as file, suppress(OSError):
+        for size in (1 << 16, 1 << 9):
+            with suppress(OSError):
+                while True:
+                    file.write(bytes(size))
+    return disk / "filler"
+
+
 def test_a_pass_that_is_closed_on_a_full_disk_is_written_once_there_is_room(recorded, settings, small_disk):
     disk = small_disk("3m")
     config = settings(state_dir=str(disk), storage={"min_free_mb": 1})
     run = Run(config, sessions.create(config.state_dir, config, None))
-    filler = disk / "filler"
-    with filler.open("wb", buffering=0) as file, suppress(OSError):
-        while True:
-            file.write(bytes(1 << 12))
+    filler = fill(disk)
     laser, stored = recorded.played.passes[0]
     run._store(laser, stored)
     passes = run.session.folder / "passes"
     assert not list(passes.iterdir())
-    assert "nothing is recorded" in run.status()["notes"][0]
+    assert "not written: pass 1 of front" in run.status()["notes"][0]
     filler.unlink()
-    run._look_at_disk()
+    run._write()
     assert [path.name for path in passes.iterdir()] == ["front-001.npz"]
-    assert not any("nothing is recorded" in note for note in run.status()["notes"])
-    run._close()
+    assert not any("not written" in note for note in run.status()["notes"])
+    run._recorder.close()
+
+
+def test_a_session_that_starts_below_the_floor_makes_room_first_or_is_refused(state, small_disk, settings):
+    disk = small_disk("8m")
+    shutil.copytree(state / "sessions", disk / "sessions")
+    config = settings(state_dir=str(disk), storage={"min_free_mb": 4})
+    fill(disk)
+    with pytest.raises(DiskFull, match="of 4 that must be") as caught:
+        Service(config).handle({"class": "START"})
+    assert "accepted" in caught.value.hint
+    assert left(disk) == ["2-accepted", "4-odd"]
+    (disk / "filler").unlink()
+    with pytest.raises(DeviceNotFound):  # there is room, and no port in this configuration
+        Service(config).handle({"class": "START"})
+    assert left(disk) == ["2-accepted", "4-odd"]
+
+
+def test_a_start_on_a_disk_without_any_room_left_removes_what_it_may(state, small_disk, settings):
+    disk = small_disk("8m")
+    shutil.copytree(state / "sessions", disk / "sessions")
+    fill(disk)
+    config = settings(state_dir=str(disk), storage={"min_free_mb": 1})
+    with pytest.raises(DeviceNotFound):
+        Service(config).handle({"class": "START"})
+    assert left(disk) == ["2-accepted", "4-odd", "5-now"]
+
+
+def test_a_quota_that_the_running_session_itself_exceeds_is_told_and_no_reason_to_stop(state):
+    space = Space(state, Storage(min_free_mb=1, quota_mb=2))
+    with capture_logs() as logs:
+        assert [space.make_room("5-now") for _ in range(2)] == [None, None]
+    assert left(state) == ["2-accepted", "4-odd", "5-now"]
+    assert space.over.startswith("sessions take 3 MB, of 2 that they may")
+    assert [entry["event"] for entry in logs] == ["session removed for room"] * 2 + ["quota exceeded"]
+    shutil.rmtree(state / "sessions" / "2-accepted")
+    assert space.make_room("5-now") is None
+    assert space.over is None
