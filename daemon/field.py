@@ -33,6 +33,7 @@ _CONFIG = "/etc/polecal/polecal.yaml"
 _STATUS_S = 1.0
 _ANSWER_S = 10.0
 _START_S = 300.0  # a device search tries every rate, twice, and may write an EEPROM
+_REPORT_S = 600.0  # hours of driving to read through, at a low priority
 _STOP_S = 120.0  # the devices are left polite, and what there is may be calibrated
 _POLL_S = 0.5
 _DECODE_BYTES = 4096
@@ -99,6 +100,10 @@ def _parser() -> argparse.ArgumentParser:
     result.add_argument("session", nargs="?", metavar="SESSION", help="its name, or a folder's path")
     result.add_argument("--format", choices=_FORMATS, default="yaml", help="for which system")
     result.add_argument("--parent", metavar="FRAME", help="the body's frame, else as that system calls it")
+    report = verb(_report, "write a session's report, an HTML page, and name it")
+    report.add_argument("session", nargs="?", metavar="SESSION", help="its name, or a folder's path")
+    report.add_argument("--out", type=Path, metavar="FILE", help="elsewhere than into the session's folder")
+    report.add_argument("--png", type=Path, metavar="DIR", help="the drawings, too, as PNG")
     replay = verb(_replay, "run a capture through the whole pipeline again, without a daemon")
     replay.add_argument("capture", type=Path, metavar="CAPTURE")
     replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
@@ -278,6 +283,24 @@ def _result(arguments: argparse.Namespace) -> int:
     if not accepted:
         _complain("this calibration was rejected", "see the reasons in its verdict; do not use it")
         return Code.REJECTED
+    return 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    answer: dict[str, Any] = {"class": "REPORT"}
+    folder = Path(arguments.session) if arguments.session and os.sep in arguments.session else None
+    if folder is None:
+        with Client(arguments.socket, _REPORT_S) as client:
+            answer = client.request({"class": "REPORT", "session": arguments.session})
+    if folder is not None or arguments.out is not None or arguments.png is not None:
+        from polecal.daemon import reporting  # noqa: PLC0415
+
+        folder = folder or Path(answer["path"]).parent
+        answer["path"] = str(reporting.write(folder, arguments.out, arguments.png))
+    if arguments.json:
+        _print_json(answer)
+    else:
+        print(answer["path"])
     return 0
 
 

@@ -29,7 +29,7 @@ from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
 from polecal import PolecalError, __version__
-from polecal.daemon import recorder
+from polecal.daemon import recorder, reporting
 from polecal.daemon.recorder import METADATA, RecorderError
 from polecal.daemon.sessions import CAPTURE
 
@@ -159,13 +159,13 @@ class Finaliser:
     def __init__(self, state_dir: Path, leave_bytes: int = 0) -> None:
         """Prepare to finalise what an earlier daemon left, not indexed yet or cut off."""
         self._leave_bytes = leave_bytes
-        self._queue: queue.Queue[Path | None] = queue.Queue()
+        self._queue: queue.Queue[tuple[Path, bool] | None] = queue.Queue()
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._closed = False
         self._log = structlog.get_logger()
         for path in sorted((state_dir / "sessions").glob(f"*/{CAPTURE}")):
-            self._queue.put(path)
+            self._queue.put((path, False))
         self._thread = threading.Thread(target=self._work, name="finaliser")
 
     def __enter__(self) -> Self:
@@ -176,8 +176,8 @@ class Finaliser:
         self.close()
 
     def add(self, capture: Path) -> None:
-        """Have a capture finalised that has just been closed."""
-        self._queue.put(capture)
+        """Have a capture finalised that has just been closed, and then its session's report written."""
+        self._queue.put((capture, True))
 
     def join(self) -> None:
         """Wait until all is done that was asked for."""
@@ -193,27 +193,48 @@ class Finaliser:
         self.join()
 
     def _work(self) -> None:
-        while (path := self._queue.get()) is not None:
+        while (item := self._queue.get()) is not None:
+            path, has_ended = item
             if not is_indexed(path):
                 self._run(path)
+            if has_ended:
+                self._report(path.parent)
 
-    def _run(self, path: Path) -> None:
-        """Finalise in a child process, unless closed."""
-        command = [sys.executable, "-m", __spec__.name, str(path), str(self._leave_bytes)]
+    def _report(self, folder: Path) -> None:
+        """Write a session's report, where the packages for it are there; a run does not depend on it."""
+        if lack := reporting.lacking():
+            self._log.info("no report", folder=str(folder), lacking=lack)
+        elif (ended := self._child_of(reporting.command(folder))) is not None:
+            code, _, why = ended
+            if code == 0:
+                self._log.info("report written", report=str(folder / reporting.NAME))
+            elif code > 0:
+                self._log.warning("no report", folder=str(folder), problem=why.strip())
+
+    def _child_of(self, command: list[str]) -> tuple[int, bytes, str] | None:
+        """Run a child process; give its exit code, output and standard error. None once closed."""
         with self._lock:
             if self._closed:
-                return
+                return None
             child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # noqa: S603
             self._child = child
         said, trouble = child.communicate()
         with self._lock:
             self._child = None
-        if child.returncode < 0 and is_indexed(path):  # killed just after it was done
+        return child.returncode, said, trouble.decode(errors="replace")
+
+    def _run(self, path: Path) -> None:
+        """Finalise in a child process, unless closed."""
+        ended = self._child_of([sys.executable, "-m", __spec__.name, str(path), str(self._leave_bytes)])
+        if ended is None:
+            return
+        code, said, trouble = ended
+        if code < 0 and is_indexed(path):  # killed just after it was done
             self._log.info("capture indexed", capture=str(path))
-        elif child.returncode < 0:
+        elif code < 0:
             self._log.info("capture is left to the next start", capture=str(path))
-        elif child.returncode:
-            why = trouble.decode(errors="replace").strip().rpartition("\n")[2]
+        elif code:
+            why = trouble.strip().rpartition("\n")[2]
             self._log.error("capture stays as it was written", capture=str(path), problem=why)
         else:
             done: dict[str, Any] = json.loads(said)

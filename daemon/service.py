@@ -17,7 +17,7 @@ from typing import Any
 import structlog
 
 from polecal import PolecalError, __version__
-from polecal.daemon import log, sessions
+from polecal.daemon import log, reporting, sessions
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, code_of
 from polecal.daemon.finalise import Finaliser
@@ -57,6 +57,10 @@ class Service:
                 return self._stop(calibrate=bool(request.get("calibrate", False)))
             case "RESULT":
                 return self._result(request.get("session"))
+            case "REPORT":
+                folder = sessions.folder_of(self._config.state_dir, request.get("session"))
+                path = reporting.write_apart(folder)
+                return {"class": "REPORT", "session": folder.name, "path": str(path)}
             case other:
                 raise Refused(
                     f"{other!r} is not a request that this daemon knows", "see README.md", Code.USAGE

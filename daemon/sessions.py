@@ -127,6 +127,16 @@ def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
     raise SessionError(wanted, "see `polecal-field status` for what is still to be driven")
 
 
+def folder_of(state_dir: Path, session: str | None) -> Path:
+    """Give a session's folder, the last one's if none is named. Raises SessionError."""
+    folders = sorted(path.parent for path in (state_dir / "sessions").glob("*/session.yaml"))
+    folders = [folder for folder in folders if session is None or folder.name == session]
+    if not folders:
+        what = "there is no session yet" if session is None else f"there is no session {session}"
+        raise SessionError(what, f"see {state_dir / 'sessions'}")
+    return folders[-1]
+
+
 def read_calibration(folder: Path) -> dict[str, Any]:
     """Read the calibration in a folder, of a session or of a replay. Raises SessionError."""
     path = folder / CALIBRATION
@@ -138,6 +148,12 @@ def read_calibration(folder: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("lasers"), list):
         raise SessionError(f"{path}: is no calibration", "name a folder with a calibration.yaml in it")
     return content
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file as a whole. Raises SessionError."""
+    with _whole_file(path) as file:
+        file.write(content)
 
 
 @contextmanager
