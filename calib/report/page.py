@@ -191,8 +191,8 @@ def _advice(laser: LaserReport) -> Iterator[str]:
         if entry["cost_m"] is not None and entry["cost_m"] > setup.criteria.cost_m:
             yield (
                 "The cost is too high: see below whether single passes stand out, or one heading, range or "
-                "bearing. Check that the pole stood firm and upright, that it was the only one, that the laser "
-                "is screwed tight, and that corrections reached the receiver."
+                "bearing. Check that the pole stood firm and upright, that it was the only one, that the "
+                "laser is screwed tight, and that corrections reached the receiver."
             )
     if entry["estimate"] is not None:
         sigma = entry["sigma"]
