@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NoReturn, cast
 
 from rich.console import Console
-from rich.live import Live
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from polecal import PolecalError, __version__
@@ -25,6 +24,7 @@ from polecal.daemon import control
 from polecal.daemon.control import Client, Code, Refused
 from polecal.daemon.routine import State
 from polecal.daemon.screen import Screen
+from polecal.daemon.watch import Terminal, Watch
 
 # The verbs that calculate or decode import what they need themselves: numpy takes longer than a status.
 
@@ -193,15 +193,18 @@ def _status(arguments: argparse.Namespace) -> int:
 
 
 def _watch(arguments: argparse.Namespace) -> int:
-    console = Console()
-    redrawn = console.is_terminal and not arguments.json
-    live = Live(console=console, auto_refresh=False, screen=True)
+    terminal = Terminal.of(sys.stdout)
+    redrawn = terminal.redraws and not arguments.json
     status: dict[str, Any] = {}
-    shown = live if redrawn else contextlib.nullcontext()
-    with Client(arguments.socket, _ANSWER_S) as client, contextlib.suppress(KeyboardInterrupt), shown:
+    shown = Watch(terminal, sys.stdout) if redrawn else contextlib.nullcontext()
+    with (
+        Client(arguments.socket, _ANSWER_S) as client,
+        contextlib.suppress(KeyboardInterrupt),
+        shown as watch,
+    ):
         for status in client.watch():
-            if redrawn:
-                live.update(Screen(status), refresh=True)
+            if watch is not None:
+                watch.show(status)
             else:
                 _show(status, arguments)
                 sys.stdout.flush()
@@ -443,7 +446,8 @@ def _show(status: dict[str, Any], arguments: argparse.Namespace) -> None:
     if arguments.json:
         _print_json(status)
     else:
-        Console().print(Screen(status))
+        terminal = Terminal.of(sys.stdout)
+        terminal.console(sys.stdout).print(Screen(status, ascii_only=terminal.ascii_only))
 
 
 def _print_json(content: dict[str, Any]) -> None:

@@ -5,8 +5,9 @@ What it gives depends on nothing but the configuration and the chunks, in their 
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -31,6 +32,7 @@ OnPass = Callable[[str, StoredPass], None]
 OnScan = Callable[[str, int, Decoded], None]
 """Takes (laser's name, host time at which its telegram began, scan) of every scan of the right variant."""
 
+_COSTS = 40  # after the last so many passes, for who looks on
 _ABSURD_SIGMAS = 20.0  # off the hand measurement: of the default 0.1 m and 5 degrees, 2 m and 100 degrees
 
 
@@ -57,11 +59,14 @@ class _LaserRun:
             on_scan=partial(on_scan, laser.name) if on_scan is not None else None,
         )
         self.result: Result | None = None
+        self.costs_m: deque[float] = deque(maxlen=_COSTS)
         self._passes: dict[int, list[Pass]] = {}  # by place
 
     def take(self, stored: StoredPass) -> None:
         self._passes.setdefault(stored.place, []).append(stored.moments)
         self.estimate(everywhere=False)
+        if self.result is not None:
+            self.costs_m.append(round(self.result.cost_m, 5))
 
     def estimate(self, *, everywhere: bool) -> None:
         """Calibrate on the passes of the pole: the thin reflector seen most evenly from all sides."""
@@ -238,7 +243,8 @@ class Pipeline:
 
     def _entry(self, laser: _LaserRun) -> dict[str, Any]:
         dropped = {reason: count for reason, count in laser.channel.dropped.items() if count}
-        return results.entry(laser.name, laser.setup, laser.result) | {"dropped": dropped}
+        told = {"dropped": dropped, "need": asdict(laser.setup.need), "costs_m": list(laser.costs_m)}
+        return results.entry(laser.name, laser.setup, laser.result) | told
 
     def _next(self) -> str:
         match self.routine.state:

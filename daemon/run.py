@@ -93,7 +93,7 @@ class Run:
         self._known = self._know()
         self._threads: list[threading.Thread] = []
         self._engine = threading.Thread(target=self._work, name="engine")
-        self._beat_s = time.monotonic()
+        self._beat_s = self._begun_s = time.monotonic()
 
     @property
     def devices(self) -> Sequence[Device]:
@@ -155,9 +155,12 @@ class Run:
                 self._lock.release()
         status, since_ns, heard = self._known
         since_s = round((time.monotonic_ns() - since_ns) / 1e9, 1)
+        run_s = round(time.monotonic() - self._begun_s, 1)
         return status | {
             "session": self.session.id,
             "since_s": since_s,
+            "run_s": run_s,
+            "disk": self._space.left(self.session.capture, run_s),
             "devices": [self._device(device, heard[device.name]) for device in self._devices],
             "notes": [*self.notes, *status["notes"]],
         }

@@ -31,28 +31,38 @@ _ROSE_HEIGHT = 11  # N, nine rows, S
 _CELL = 9  # 330°✓1250
 _ROSE_SLICES = 12  # more would overlap
 _GRID_SLICES = 24  # more are marks alone
+_PACE_SLICES = 3  # done, before a pace can be told
+_LONG_S, _SOON_S = 10 * 3600, 1800  # of disk left: no need to tell, and need to shout
+_BARS = "▁▂▃▄▅▆▇█"
+_SPARKS = 24
 _PROBLEM_LINES = 2  # of a device's problem, and again of its hint
 _LEAST_TALK = 3  # lines for verdict and notes; where a rose leaves fewer, there is none
-_ASCII = str.maketrans({"✓": "+", "·": "-", "●": "*", "○": "o", "—": "-", "▶": ">", "→": ">", "…": "~"}) | (
-    str.maketrans({"°": "d", "±": "+", "√": "", "–": "-", "×": "x", "─": "-", "σ": "s"})
-)
+_ASCII = str.maketrans("✓✗·●○—▶→…°–×─−±σ²≤≥" + _BARS, "+x.*o->>~d-x--~s2<>" + "_.-=+*#@") | {ord("√"): None}
 
 
 class Screen:
     """A STATUS object that rich can print; keys that are missing or None show as a dash."""
 
-    def __init__(self, status: Mapping[str, Any]) -> None:
+    def __init__(self, status: Mapping[str, Any], *, ascii_only: bool = False) -> None:
         self._status = status
+        self._ascii_only = ascii_only
 
     def __rich_console__(self, _: Console, options: ConsoleOptions) -> RenderResult:
-        width = min(options.max_width, WIDTH)
-        for line in _lines(self._status, width):
-            if options.ascii_only:
-                line.plain = line.plain.translate(_ASCII).encode("ascii", "replace").decode()
-            line.rstrip()
-            line.truncate(width, overflow="ellipsis")
-            line.no_wrap = True
-            yield line
+        ascii_only = self._ascii_only or options.ascii_only
+        yield from lines(self._status, min(options.max_width, WIDTH), ascii_only=ascii_only)
+
+
+def lines(status: Mapping[str, Any], width: int = WIDTH, *, ascii_only: bool = False) -> list[Text]:
+    """Draw a STATUS object: at most `HEIGHT` lines of at most ``width`` columns, without a line's end."""
+    drawn = _lines(status, width)
+    for line in drawn:
+        line.plain = "".join(char for char in line.plain if char.isprintable())
+        if ascii_only:
+            line.plain = line.plain.translate(_ASCII).encode("ascii", "replace").decode()
+        line.rstrip()
+        line.truncate(width, overflow="ellipsis" if not ascii_only else "crop")
+        line.no_wrap = True
+    return drawn
 
 
 def _lines(status: Mapping[str, Any], width: int) -> list[Text]:
@@ -60,7 +70,7 @@ def _lines(status: Mapping[str, Any], width: int) -> list[Text]:
     top = [_title(status, width)]
     for device in _list(status.get("devices")):
         top += _device(device, width)
-    top.append(Text("─" * width, style="dim"))
+    top.append(_rule(status, width))
     bottom = _said("▶ next: ", [status["next"]], width, 2, "bold") if status.get("next") else []
     top = top[: HEIGHT - len(bottom)]
     room = HEIGHT - len(top) - len(bottom)
@@ -76,6 +86,39 @@ def _lines(status: Mapping[str, Any], width: int) -> list[Text]:
             share = (room - len(middle)) // (len(lasers) - number)
             middle += _brief(laser, ended, width, share)
     return [*top, *middle, *bottom]
+
+
+def _rule(status: Mapping[str, Any], width: int) -> Text:
+    """Draw the line below the devices; at its end what is left of the drive and of the disk."""
+    told = []
+    if (drive_s := _drive_left_s(status)) is not None:
+        told.append(f"at this pace {_duration(drive_s, coarse=True)} of driving left")
+    disk = _dict(status.get("disk"))
+    if isinstance(disk.get("left_s"), int | float):
+        left_s = disk["left_s"]
+        told.append(f"disk full in {_duration(left_s, coarse=True)}" if left_s < _LONG_S else "disk ok")
+    elif isinstance(disk.get("free_mb"), int | float):
+        told.append(f"disk {disk['free_mb']:.0f} MB")
+    said = "".join(f" {each} ──" for each in told)
+    line = Text().append("─" * max(0, width - len(said)), style="dim")
+    soon = isinstance(disk.get("left_s"), int | float) and disk["left_s"] < _SOON_S
+    return line.append(said, style="bold yellow" if soon else "")
+
+
+def _drive_left_s(status: Mapping[str, Any]) -> float | None:
+    """Give how long the slices that are missing will take, if they come as those did that are done."""
+    run_s = status.get("run_s")
+    if status.get("state") != "collecting" or not isinstance(run_s, int | float):
+        return None
+    left_s = []
+    for laser in _list(status.get("lasers")):
+        slices = _list(laser.get("coverage"))
+        needed = min(_dict(laser.get("need")).get("slices_needed") or len(slices), len(slices))
+        done = sum(bool(part.get("done")) for part in slices)
+        if done < _PACE_SLICES:
+            return None
+        left_s.append(run_s * max(0, needed - done) / done)
+    return max(left_s, default=0.0) or None
 
 
 def _title(status: Mapping[str, Any], width: int) -> Text:
@@ -108,7 +151,17 @@ def _device(device: Mapping[str, Any], width: int) -> list[Text]:
     for key, word in (("bad_frames", "bad"), ("reconnects", "lost")):
         if device.get(key):
             line.append(f" {_count(device[key])} {word}", style="yellow")
+    kind = str(device.get("position_type") or "").removeprefix("INS_")
+    if kind and line.cell_len + 1 + len(kind) <= width:
+        line.append(f" {kind}", style="dim")
     lines = [line]
+    health = _dict(device.get("health"))
+    faults = [
+        *_list(health.get("faults")),
+        *(["its window is dirty: clean it"] if health.get("polluted") else []),
+    ]
+    if faults:
+        lines += _said("     ", ["the laser reports: " + "; ".join(map(str, faults))], width, 1, "yellow")
     if state != "streaming":
         for key, mark, shade in (("problem", "", "red"), ("hint", "→ ", "")):
             if device.get(key):
@@ -122,8 +175,10 @@ def _whole(laser: Mapping[str, Any], width: int) -> list[Text]:
     done = f"{sum(bool(part.get('done')) for part in slices)} of {len(slices)}"
     title = Text(f" {laser.get('name') or NONE}", style="bold")
     title.append(f"   {_passes(laser)}, {done} slices done", style="not bold")
-    title.append("     ✓ done  ~ too little  · nothing", style="not bold dim")
-    rose = _rose(slices, done) if len(slices) <= _ROSE_SLICES else _grid(slices)
+    need = _dict(laser.get("need"))
+    legend = "   ✓ has, −63 lacks returns, −1p passes" if need else "   ✓ done ~ begun · not"
+    title.append(legend, style="not bold dim")
+    rose = _rose(slices, need, done) if len(slices) <= _ROSE_SLICES else _grid(slices, need)
     table = [Text(), *_table(laser), Text(), *_costs(laser)]
     body = []
     for row in range(_ROSE_HEIGHT):
@@ -133,15 +188,15 @@ def _whole(laser: Mapping[str, Any], width: int) -> list[Text]:
     return [title, *body]
 
 
-def _rose(slices: list[Mapping[str, Any]], done: str) -> list[Text]:
-    """Draw the slices as a compass, north up: first heading of each, mark, returns on the pole."""
+def _rose(slices: list[Mapping[str, Any]], need: Mapping[str, Any], done: str) -> list[Text]:
+    """Draw the slices as a compass, north up: first heading of each, mark, returns on the pole or missing."""
     middle, half = _ROSE_WIDTH // 2, _ROSE_HEIGHT // 2
     rows: dict[int, list[tuple[int, Text]]] = {row: [] for row in range(-half, half + 1)}
     for index, part in enumerate(slices):
         angle = 2 * math.pi * (index + 0.5) / len(slices)
         mark, style = _mark(part)
         cell = Text(f"{360 * index // len(slices):>3}°")
-        cell.append(f"{mark}{_count(part.get('pole_returns'), 4)}", style=style)
+        cell.append(f"{mark}{_amount(part, need)}", style=style)
         aside = round(_ROSE_RADIUS_X * math.sin(angle))
         column = middle + aside if aside > 0 else middle + aside + 1 - cell.cell_len
         if aside == 0:
@@ -161,7 +216,7 @@ def _rose(slices: list[Mapping[str, Any]], done: str) -> list[Text]:
     return lines
 
 
-def _grid(slices: list[Mapping[str, Any]]) -> list[Text]:
+def _grid(slices: list[Mapping[str, Any]], need: Mapping[str, Any]) -> list[Text]:
     """Show more slices than a compass holds: as a table, or as marks alone."""
     many = len(slices) > _GRID_SLICES
     columns = 30 if many else 3
@@ -174,7 +229,7 @@ def _grid(slices: list[Mapping[str, Any]]) -> list[Text]:
                 line.append(mark, style=style)
             else:
                 line.append(f"{360 * index // len(slices):>3}°")
-                line.append(f"{mark}{_count(slices[index].get('pole_returns')):<6}", style=style)
+                line.append(f"{mark}{_amount(slices[index], need):<6}", style=style)
         lines.append(line)
     return lines
 
@@ -201,6 +256,8 @@ def _costs(laser: Mapping[str, Any]) -> list[Text]:
     line = Text("cost  ").append(f"{_number(now, 3):>8}", style="bold").append(" m")
     line.append(f"   by hand {_number(hand, 3)} m", style="dim")
     lines = [line]
+    if spark := _spark(_list(laser.get("costs_m")), _SPARKS):
+        lines.append(Text("√c    ").append(spark, style="cyan"))
     gain = laser.get("improvement")
     if isinstance(gain, int | float):
         lines.append(Text(f"      improving by {100 * gain:.1f} %", style="dim"))
@@ -238,6 +295,9 @@ def _brief(laser: Mapping[str, Any], ended: bool, width: int, room: int) -> list
             found = _number(estimate.get(key), 3 if unit == "m" else 2)
             line.append(f"{name:<5} {found:>7} {spread:<10}")
         lines.append(line.append(unit))
+    spark = _spark(_list(laser.get("costs_m")), _SPARKS)
+    if spark and room > len(lines) + 1:
+        lines.append(Text("   √c    ").append(spark, style="cyan"))
     return [*lines, *_verdict(laser, ended, width, room - len(lines))][: max(0, room)]
 
 
@@ -270,6 +330,28 @@ def _mark(part: Mapping[str, Any]) -> tuple[str, str]:
     return _BEGUN if part.get("pole_returns") or part.get("passes") else _EMPTY
 
 
+def _amount(part: Mapping[str, Any], need: Mapping[str, Any]) -> str:
+    """Write what a slice has, or what it still needs: "412", "−63", "−1p"."""
+    returns, passes = part.get("pole_returns"), part.get("passes")
+    if not part.get("done") and isinstance(returns, int) and isinstance(passes, int):
+        lacks = need.get("min_pole_returns", 0) - returns
+        if lacks > 0:
+            return f"−{_count(lacks, 3)}"
+        if (lacks := need.get("min_passes", 0) - passes) > 0:
+            return f"−{_count(lacks, 2)}p"
+    return _count(returns, 4)
+
+
+def _spark(values: list[Any], most: int) -> str:
+    """Draw numbers as bars, the last ``most``; the highest bar is the largest of them."""
+    numbers = [float(value) for value in values if isinstance(value, int | float) and math.isfinite(value)]
+    numbers = numbers[-most:]
+    top = max(numbers, default=0.0)
+    if top <= 0:
+        return ""
+    return "".join(_BARS[min(len(_BARS) - 1, int(len(_BARS) * max(0.0, n) / top))] for n in numbers)
+
+
 def _passes(laser: Mapping[str, Any]) -> str:
     count = laser.get("passes")
     return f"{_count(count)} pass{'' if count == 1 else 'es'}"
@@ -297,7 +379,13 @@ def _count(value: object, most: int = 5) -> str:
     return f"{value}{unit}"
 
 
-def _duration(seconds: float) -> str:
+def _duration(seconds: float, *, coarse: bool = False) -> str:
+    """Write a time; ``coarse`` to two figures or so, so that it does not change at each look."""
+    if coarse:
+        for unit, length in (("h", 3600), ("min", 60)):
+            if seconds >= 2 * length:
+                return f"{seconds / length:.0f} {unit}"
+        return f"{max(10, round(seconds, -1)):.0f} s"
     minutes, seconds = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import structlog
 import yaml
@@ -16,6 +17,7 @@ from polecal.daemon.sessions import CALIBRATION
 MAKE_ROOM = "make room on the disk: what is known is kept, and recording goes on"
 
 _MB = 1_000_000
+_PACE_S = 10.0  # of a recording, before it can be said how fast it grows
 
 
 class Space:
@@ -37,6 +39,15 @@ class Space:
     def floor_bytes(self) -> int:
         """What stays free: passes and calibrations are written into it, captures are not."""
         return self._storage.min_free_mb * _MB
+
+    def left(self, capture: Path, run_s: float) -> dict[str, Any] | None:
+        """Give the room to record on, and for how long it will do at a capture's pace, once that is known."""
+        try:
+            room, recorded = max(0, self._free_bytes() - self.floor_bytes), capture.stat().st_size
+        except OSError:  # the folder is gone: what records says so
+            return None
+        left_s = round(room * run_s / recorded) if recorded and run_s > _PACE_S else None
+        return {"free_mb": room // _MB, "left_s": left_s}
 
     def lacking(self) -> str | None:
         """Say that the disk is too full to record on, None if it is not."""

@@ -2,12 +2,14 @@
 
 import copy
 import io
+import os
 import re
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from polecal.daemon.screen import Screen
+from polecal.daemon.screen import Screen, lines
 
 ESTIMATE = {
     "x_m": -0.028,
@@ -228,3 +230,194 @@ def test_a_terminal_without_unicode_gets_ascii():
     text = console.file.getvalue()
     assert text.isascii()
     assert "0d+412" in text
+
+
+# --- golden drawings: what each state looks like, in full and in ASCII
+
+GOLDEN = Path(__file__).parent / "golden"
+NEED = {"slice_deg": 30, "min_pole_returns": 100, "min_passes": 1, "slices_needed": 12}
+CLOSED = [device | {"state": "closed", "rate_hz": 0.0, "frames": 0, "bad_frames": 0} for device in DEVICES]
+NOTHING = {
+    "passes": 0,
+    "coverage": coverage([0] * 12),
+    "estimate": None,
+    "sigma": None,
+    "cost_m": None,
+    "measured_cost_m": None,
+    "verdict": {"accepted": False, "reasons": ["no pass of the pole yet"]},
+}
+COSTS = [0.214, 0.182, 0.121, 0.067, 0.048, 0.039, 0.036, 0.033, 0.031]
+SILENT = CLOSED[0] | {
+    "state": "connecting",
+    "problem": "/dev/polecal-lms-front: no laser answers at 9600, 19200, 38400, 500000 bit/s: silence",
+    "hint": "check the laser's power (it needs a minute to start) and the data cable",
+}
+ALIGNING = DEVICES[1] | {"ins_status": "WAITING_AZIMUTH", "position_type": "INS_RTKFIXED", "bad_frames": 0}
+LATE = {"costs_m": COSTS, "improvement": 0.034, "need": NEED, "dropped": {"no pose there": 1234}}
+DONE = LATE | {"coverage": coverage([150] * 12), "passes": 19}
+FEW_PASSES = [{"slice": k, "pole_returns": 250, "passes": 1 + k % 3, "done": k % 3 == 2} for k in range(12)]
+REASONS = ["√c is 0.081 m, more than 0.05 m", "z is known to ±31 mm, not ±20 mm"]
+OK_DISK = {"free_mb": 70123, "left_s": 900000}
+LONG = "a name that somebody has thought much too long about " * 4
+
+SCENES = {
+    "idle": status(state="idle", session=None, lasers=[], devices=CLOSED, next="polecal-field start"),
+    "connecting": status(
+        NOTHING | {"need": NEED},
+        state="connecting",
+        devices=[SILENT, DEVICES[1]],
+        next="wait: not all devices stream yet",
+        disk={"free_mb": 70123, "left_s": None},
+    ),
+    "aligning": status(
+        NOTHING | {"need": NEED},
+        state="aligning",
+        devices=[DEVICES[0], ALIGNING],
+        notes=["navigation says WAITING_AZIMUTH: the roll and pitch are known, not yet the heading"],
+        next="drive until the navigation has aligned: straight, briskly, with a few turns",
+        disk=OK_DISK,
+    ),
+    "collecting early": status(
+        {
+            "need": NEED,
+            "passes": 1,
+            "coverage": coverage([0, 0, 37] + [0] * 9),
+            "costs_m": [0.214],
+            "held": ["z"],
+        }
+        | {"verdict": {"accepted": False, "reasons": ["slices 0, 1, 3–11 have no pass", "one is few"]}},
+        next="drive past the pole from any side but heading 60–90°",
+        run_s=40.0,
+        disk=OK_DISK,
+    ),
+    "collecting late": status(LATE, run_s=121.0, disk={"free_mb": 500, "left_s": 5400}),
+    "collecting, passes missing": status(
+        LATE
+        | {"need": NEED | {"min_passes": 3}}
+        | {
+            "coverage": [
+                {"slice": k, "pole_returns": 250, "passes": 1 + k % 3, "done": k % 3 == 2} for k in range(12)
+            ]
+        }
+    ),
+    "accepted": status(
+        DONE | {"verdict": {"accepted": True, "reasons": []}},
+        state="accepted",
+        next="",
+        devices=CLOSED,
+        disk=OK_DISK,
+    ),
+    "rejected": status(
+        DONE
+        | {
+            "verdict": {
+                "accepted": False,
+                "reasons": REASONS,
+            }
+        },
+        state="rejected",
+        next="",
+        devices=CLOSED,
+        disk=OK_DISK,
+    ),
+    "fault": status(
+        LATE,
+        state="fault",
+        devices=[
+            DEVICES[0] | {"health": {"faults": ["fatal 49: laser power"], "polluted": True}},
+            DEVICES[1]
+            | {
+                "state": "lost",
+                "problem": "/dev/polecal-span: the port stopped working",
+                "hint": "check the cable",
+            },
+        ],
+        notes=["a bug in polecal: ZeroDivisionError()"],
+        next="",
+    ),
+    "two lasers": status(
+        devices=[DEVICES[0], DEVICES[0] | {"name": "left"}, DEVICES[1]],
+        lasers=[LASER | LATE, LASER | NOTHING | {"name": "left", "need": NEED}],
+        disk=OK_DISK,
+        run_s=100.0,
+    ),
+    "four lasers": status(
+        devices=[*(DEVICES[0] | {"name": name} for name in ("front", "left", "right", "rear")), DEVICES[1]],
+        lasers=[LASER | LATE | {"name": name} for name in ("front", "left", "right", "rear")],
+        disk=OK_DISK,
+    ),
+    "long words": status(
+        LATE | {"name": LONG, "verdict": {"accepted": False, "reasons": [LONG] * 5}},
+        session=LONG,
+        notes=[LONG] * 5,
+        next=LONG,
+        devices=[d | LOST | {"name": LONG, "port": "/dev/" + LONG, "problem": LONG} for d in DEVICES],
+    ),
+    "disk full": status(
+        LATE,
+        notes=["nothing is recorded: only 120 MB are free on the disk, of 200 that must be"],
+        disk={"free_mb": 0, "left_s": 0},
+    ),
+}
+
+
+def scene(made):
+    """Draw it as it is, and below it in ASCII."""
+    return "".join(
+        "\n".join(line.plain for line in lines(made, ascii_only=ascii_only)) + "\n" + "=" * 80 + "\n"
+        for ascii_only in (False, True)
+    )
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_each_state_looks_as_it_was_last_found_good(name):
+    """After a change on purpose: ``POLECAL_GOLDEN=write``, then look at what git shows as changed."""
+    path = GOLDEN / f"{name.replace(', ', '-').replace(' ', '-')}.txt"
+    if os.environ.get("POLECAL_GOLDEN") == "write":
+        path.write_text(scene(SCENES[name]), encoding="utf-8")
+    assert scene(SCENES[name]) == path.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_state_needs_more_than_80_by_24_nor_more_than_ascii(name):
+    for width in (80, 60, 40):
+        drawn = lines(SCENES[name], width, ascii_only=True)
+        assert len(drawn) <= 23
+        assert all(line.cell_len <= width for line in drawn)
+        assert all(line.plain.isascii() for line in drawn)
+
+
+def test_what_a_terminal_would_take_for_a_command_is_not_passed_on():
+    drawn = lines(status({"name": "\x1b[2J\x07"}, session="a\x1b]0;b\x07\tc", next="go\r\non\x9b2J"))
+    assert not [char for line in drawn for char in line.plain if not char.isprintable()]
+
+
+def test_what_a_slice_still_needs_is_said():
+    parts = [
+        {"slice": 0, "pole_returns": 412, "passes": 2, "done": True},
+        {"slice": 1, "pole_returns": 37, "passes": 1, "done": False},
+        {"slice": 2, "pole_returns": 0, "passes": 0, "done": False},
+        {"slice": 3, "pole_returns": 140, "passes": 1, "done": False},
+    ]
+    text = drawn(status({"coverage": parts, "need": NEED | {"min_passes": 2}}))
+    for told in ("0°✓412", "90°~−63", "180°·−100", "270°~−1p"):
+        assert told in text
+
+
+def test_cost_is_drawn_as_it_falls():
+    text = drawn(status({"costs_m": [0.4, 0.2, 0.1, 0.05]}))
+    assert "√c    █▅▃▂" in text
+    assert "√c" not in drawn(status({"costs_m": [float("nan"), None]}))
+
+
+def test_time_and_disk_left_are_told_and_a_disk_that_is_soon_full_is_told_loudly():
+    rule = {}
+    for left in (1e6, 7300, 60):
+        rule[left] = drawn(status(disk={"free_mb": 9, "left_s": left})).splitlines()[3]
+    assert rule[1e6].endswith("disk ok ──")
+    assert rule[7300].endswith("disk full in 2 h ──")
+    assert rule[60].endswith("disk full in 60 s ──")
+    assert "1;33m disk full" in drawn(
+        status(disk={"free_mb": 9, "left_s": 60}), force_terminal=True, color_system="standard"
+    )
+    assert "at this pace 40 s of driving left" in drawn(status(run_s=80.0))  # 8 of 12 slices done

@@ -134,3 +134,16 @@ def test_a_quota_that_the_running_session_itself_exceeds_is_told_and_no_reason_t
     shutil.rmtree(state / "sessions" / "2-accepted")
     assert space.make_room("5-now") is None
     assert space.over is None
+
+
+def test_what_is_left_is_told_in_time_once_the_pace_is_known(state):
+    capture = state / "sessions" / "5-now" / "capture.mcap"
+    space = Space(state, Storage(min_free_mb=1))
+    free_mb = shutil.disk_usage(state).free // MB
+    early, later = space.left(capture, 3.0), space.left(capture, 90.0)  # 0.9 MB in 90 s
+    assert early is not None
+    assert later is not None
+    assert early["left_s"] is None
+    assert later["left_s"] == pytest.approx(free_mb * 100, rel=0.01)
+    assert later["free_mb"] == pytest.approx(free_mb, rel=0.01)
+    assert space.left(state / "gone", 90.0) is None
