@@ -1,4 +1,4 @@
-"""An estimate to a verdict, by the cost's threshold and by its rate of improvement, with reasons in words."""
+"""An estimate to a verdict: by its cost, by whether that still improves, and by what would make it untrue."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ class Criteria:
     """When a result is good: bounds on √c (m), its relative improvement, and σ (m, rad)."""
 
     cost_m: float = 0.05
+    left_out_m: float = 0.06
+    """Of passes by the solutions without them: higher than `cost_m` where the fit is too good."""
     improvement: float = 0.02
+    """Through the last passes."""
+    doubling: float = 0.05
+    """From half of the passes to all."""
     mode: Literal["all", "any"] = "all"
     max_sigma: tuple[float, ...] = (0.02, 0.02, 0.02, *(float(np.radians(0.1)),) * 3)
     max_shift_sigmas: float = 4.0
@@ -35,6 +40,15 @@ class Verdict:
     hopeless: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """From one pass to the next an unknown (its index) is another, by so much, m or rad."""
+
+    index: int
+    by: float
+    first_passes: int
+
+
 def judge(
     *,
     criteria: Criteria,
@@ -42,7 +56,11 @@ def judge(
     slices: Sequence[Slice],
     passes: int,
     cost_m: float,
+    left_out_m: float | None,
     improvement: float | None,
+    doubling: float | None,
+    jump: Jump | None,
+    last_set_aside: str | None,
     sigma: Array,
     held: Sequence[str],
     shift: Array,
@@ -63,33 +81,53 @@ def judge(
             missing.append(f"{_slices(thin)} too few passes or pole returns")
     if passes < FEWEST_PASSES:
         missing.append(f"{passes} passes of the pole are too few to tell how good the result is")
-    cheap = cost_m <= criteria.cost_m
-    settled = improvement is not None and improvement <= criteria.improvement
-    grounds = []
-    if not cheap:
-        grounds.append(f"cost {cost_m:.3f} m is above {criteria.cost_m:.3f} m")
-    if not settled:
-        grounds.append(
-            "the cost's improvement is not known yet"
-            if improvement is None
-            else f"the cost still improves by {improvement:.1%}, above {criteria.improvement:.1%}"
+    if last_set_aside is not None:
+        missing.append(f"the last pass disagrees with those before, {last_set_aside}: drive another")
+    dear = [
+        f"{what} {value:.3f} m is above {most:.3f} m"
+        for what, value, most in (
+            ("cost", cost_m, criteria.cost_m),
+            ("cost of passes left out of the fit,", left_out_m, criteria.left_out_m),
         )
-    if criteria.mode == "any" and (cheap or settled):
-        grounds = []
+        if value is not None and value > most
+    ]
+    rates = (("", improvement, criteria.improvement), (" with twice the passes", doubling, criteria.doubling))
+    unsettled = [
+        f"the cost still improves by {rate:.1%}{when}, above {most:.1%}"
+        for when, rate, most in rates
+        if rate is not None and rate > most
+    ]
+    if improvement is None or doubling is None:
+        unsettled = ["the cost's improvement is not known yet"]
+    grounds = [] if criteria.mode == "any" and not (dear and unsettled) else dear + unsettled
+    if jump is not None and abs(jump.by) > criteria.max_sigma[jump.index]:
+        grounds.append(
+            f"{PARAMETERS[jump.index]} is {_shown(jump.index, abs(jump.by))} different after the first "
+            f"{jump.first_passes} passes: check that laser, antenna and pole are fast, and drive anew"
+        )
     vague = [
         f"{name} is known to ±{_shown(index, sigma[index])}, not ±{_shown(index, criteria.max_sigma[index])}"
         for index, name in enumerate(PARAMETERS)
         if name not in held and sigma[index] > criteria.max_sigma[index]
     ]
     shift = np.concatenate([shift[:3], wrap(shift[3:])])
+    shifts = np.abs(shift) / measured_sigma
     far = [
         f"{name} comes out {_shown(index, abs(shift[index]))} from the hand measurement: measure again, "
         "or check that the pole was the only one"
         for index, name in enumerate(PARAMETERS)
-        if abs(shift[index]) > criteria.max_shift_sigmas * measured_sigma[index]
+        if shifts[index] > criteria.max_shift_sigmas
     ]
+    for part, names in ((slice(0, 3), "x, y and z"), (slice(3, 6), "roll, pitch and yaw")):
+        together = float(np.linalg.norm(shifts[part]))
+        if shifts[part].max() <= criteria.max_shift_sigmas < together:
+            off = _shown(part.start, float(np.linalg.norm(shift[part])))
+            far.append(
+                f"{names} together come out {off} from the hand measurement, {together:.1f} σ: "
+                "measure again, from the point whose position the navigation gives"
+            )
     reasons = (*missing, *grounds, *vague, *far)
-    hopeless = not missing and settled and (bool(far) or (bool(grounds) and not cheap))
+    hopeless = not missing and not unsettled and bool(far or grounds)
     return Verdict(not reasons, reasons, hopeless)
 
 

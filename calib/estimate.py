@@ -10,7 +10,7 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from polecal.calib import moments, solve
+from polecal.calib import consistency, moments, solve
 from polecal.calib.acceptance import Criteria, Verdict, judge
 from polecal.calib.blas import one_thread
 from polecal.calib.coverage import Need, Slice, coverage, slice_of
@@ -30,8 +30,9 @@ _MOST_SET_ASIDE = 0.25  # of all passes: where more disagree, it is not they tha
 _LEAST_M = 0.02  # of √c: what few passes fit better than their returns are is fitted too well
 _FARTHEST = 20.0  # σ of the hand measurement: beyond, there is no such mount
 _ODD, _ODD_M = 6.0, 0.06  # times the passes' median, and at least so far
-_TELLING = (2e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
-"""An extra known no better than this is not told: 1 cm at 5 m/s; 5 mm; 5 mm on a metre; 2 cm on ten."""
+_TELLING = (10e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
+"""What an extra may be where the data know it no better: the latency of a serial adapter; 5 mm; 5 mm on a
+metre; 2 cm on ten."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +78,10 @@ class Result:
     ``extras`` are those of `solve.EXTRAS` that the data could tell, with their σ; the others are 0. A
     ``time_s`` is by how much later than its stamps say the laser measured.
     ``covariance`` is (6, 6) in m and rad, order `PARAMETERS`. Costs are √c of Eq. 7 in m, after pole
-    returns were moved to the pole's axis. ``improvement`` is by how much of itself √c over all data fell
-    through the last passes, or None before there are enough. ``set_aside`` has the passes that disagree with
-    the others and were not used, by id, and why; nothing else counts them.
+    returns were moved to the pole's axis; ``left_out_m`` is that of the passes each by the solution without
+    it. ``improvement`` is by how much of itself √c over all data fell through the last passes, ``doubling``
+    from every second pass to all; they are None before there are enough passes. ``set_aside`` has the passes
+    that disagree with the others and were not used, by id, and why; nothing else counts them.
     """
 
     mount: Mount
@@ -90,7 +92,9 @@ class Result:
     sigma: Mount
     covariance: Array
     held: tuple[str, ...]
+    left_out_m: float | None
     improvement: float | None
+    doubling: float | None
     slices: tuple[Slice, ...]
     passes: int
     set_aside: dict[int, str]
@@ -209,6 +213,8 @@ class _Found:
     covariance: Array
     held: frozenset[str]
     ratios: tuple[float, float]
+    left_out: Array | None
+    """(P, 12) without each used pass, or None where there are too few."""
 
 
 class _Problem:
@@ -252,8 +258,10 @@ class _Problem:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
             squared = max(whole.cost(vector), _LEAST_M**2)
+            left_out = None
             if enough:
-                covariance = jackknife(np.stack([solve.minimise(part, vector, held) for part in without]))
+                left_out = np.stack([solve.minimise(part, vector, held) for part in without])
+                covariance = jackknife(left_out)
             else:
                 covariance = from_model(whole.slope(vector)[1], squared, len(numbers), free)
             # A scatter cannot see what no pass tells at all; what all returns, were they independent, could
@@ -270,7 +278,7 @@ class _Problem:
                 doubt = np.maximum(doubt, far * free)
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
-                return _Found(vector, covariance, frozenset(held), ratios)
+                return _Found(vector, covariance, frozenset(held), ratios, left_out)
             held.add(UNKNOWNS[worst])
 
     def oddest(self, used: NDArray[np.bool_], vector: Array) -> tuple[int, str] | None:
@@ -303,17 +311,27 @@ class _Problem:
         paper = self._form(used, (np.inf, np.inf))  # Eq. 7
         passes = [one for one, is_used in zip(self._passes, used, strict=True) if is_used]
         mask = _mask(held)[:6]
-        covariance = found.covariance[:6, :6].copy()
+        covariance = found.covariance[:6, :6] + self._not_told(used, found)
         covariance[mask, mask] = self._measured_sigma[:6][mask] ** 2
         sigma = np.sqrt(np.diag(covariance))
         spread = np.sqrt(np.diag(found.covariance))
         told = [index for index, name in enumerate(UNKNOWNS) if name in EXTRAS and name not in held]
         cost_m = solve.cost_m(paper, vector)
-        improvement = None
-        if len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
-            early = _but(used, *np.flatnonzero(used)[-_LAST_PASSES:].tolist())
-            before = solve.minimise(self._form(early, found.ratios), vector, held)
-            improvement = solve.cost_m(paper, before) / cost_m - 1.0 if cost_m else 0.0
+        order = np.flatnonzero(used)
+        improvement = doubling = None
+        if len(passes) > max(_LAST_PASSES, FEWEST_PASSES) and cost_m:
+            # Halves that have seen as much: from every heading every other pass.
+            turned = sorted(order.tolist(), key=lambda number: min(self._passes[number].pole_returns))
+            some = (order[:-_LAST_PASSES].tolist(), turned[::2], turned[1::2])
+            last, *halves = (
+                solve.cost_m(paper, self._minimum_of(numbers, found)) / cost_m - 1.0 for numbers in some
+            )
+            improvement, doubling = last, float(np.mean(halves))
+        elif len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
+            improvement = doubling = 0.0
+        left_out_m = None
+        if found.left_out is not None:
+            left_out_m = consistency.left_out_m(self.pole, self.ground, used, found.left_out, found.ratios)
         slices = coverage([one.pole_returns for one in passes], setup.need)
         verdict = judge(
             criteria=setup.criteria,
@@ -321,7 +339,11 @@ class _Problem:
             slices=slices,
             passes=len(passes),
             cost_m=cost_m,
+            left_out_m=left_out_m,
             improvement=improvement,
+            doubling=doubling,
+            last_set_aside=set_aside.get(self._passes[-1].id),
+            jump=None if found.left_out is None else consistency.jump(found.left_out),
             sigma=sigma,
             held=tuple(held),
             shift=(vector - self._measured)[:6],
@@ -336,7 +358,9 @@ class _Problem:
             sigma=Mount(*(float(value) for value in (*sigma[:3], *np.degrees(sigma[3:])))),
             covariance=covariance,
             held=tuple(name for name in PARAMETERS if name in held),
+            left_out_m=left_out_m,
             improvement=improvement,
+            doubling=doubling,
             slices=slices,
             passes=len(passes),
             set_aside=set_aside,
@@ -346,6 +370,28 @@ class _Problem:
             },
             verdict=verdict,
         )
+
+    def _minimum_of(self, numbers: Sequence[int], found: _Found) -> Array:
+        """Find the minimum of some passes, what is held and how they weigh as in ``found``."""
+        some = np.zeros(len(self._passes), dtype=bool)
+        some[list(numbers)] = True
+        return solve.minimise(self._form(some, found.ratios), found.vector, found.held)
+
+    def _not_told(self, used: NDArray[np.bool_], found: _Found) -> Array:
+        """Give what the extras that should be solved for and cannot add to the covariance (6, 6).
+
+        They are held at 0, and may be as far from it as they need not to be told: what is found would move
+        with them. A drive at one speed, forward, knows x no better than the time offset times that speed.
+        """
+        free = ~_mask(found.held)
+        untold = np.flatnonzero(_mask(self._setup.extras & found.held))
+        hessian = self._form(used, found.ratios).slope(found.vector)[1]
+        moved = np.zeros((len(UNKNOWNS), len(untold)))
+        moved[free] = np.linalg.pinv(hessian[np.ix_(free, free)], rcond=1e-12, hermitian=True) @ (
+            -hessian[np.ix_(free, untold)] * self._measured_sigma[untold]
+        )
+        added: Array = moved[:6] @ moved[:6].T
+        return added
 
     def _form(self, used: NDArray[np.bool_], ratios: tuple[float, float]) -> Form:
         return Form(self.pole.form(used, ratios[0]), self.ground.form(used, ratios[1]))

@@ -85,6 +85,15 @@ class Scatter:
         weight: Array = self.count[used] / (1.0 + self.count[used] / ratio)
         return weight
 
+    def left_out(self, number: int, rows: Array, used: NDArray[np.bool_], ratio: float = np.inf) -> float:
+        """Give Σ, m², of a pass's returns' way, in the rows (k, 108), from the other used passes' mean."""
+        others = used & (self.sites == self.sites[number])
+        others[number] = False
+        weight, mean = self.weighted_mean(others, ratio)
+        off = rows @ (self._mean[number] - mean) if weight else np.zeros(len(rows))
+        within = np.einsum("ki,ij,kj->", rows, self._within[number], rows)
+        return float(within + self.count[number] * off @ off)
+
     def means(self, rows: Array) -> Array:
         """Give each pass's mean (P, k) in the given rows (k, 108): `_rows` of a vector."""
         means: Array = self._mean @ rows.T

@@ -257,10 +257,16 @@ class MaxSigma(_Part):
 
 
 class Accept(_Part):
-    """What makes a calibration good enough; ``cost_m`` is on the square root of Eq. 7."""
+    """What makes a calibration good enough; ``cost_m`` is on the square root of Eq. 7.
+
+    ``left_out_m`` is on the same of passes left out of the fit; ``improvement`` on the part of it by which it
+    still falls through the last passes, ``doubling`` from every second pass to all.
+    """
 
     cost_m: Positive = 0.05
+    left_out_m: Positive = 0.06
     improvement: Annotated[float, Field(gt=0, lt=1)] = 0.02
+    doubling: Annotated[float, Field(gt=0, lt=1)] = 0.05
     mode: Literal["all", "any"] = "all"
     max_sigma: MaxSigma = MaxSigma()
 

@@ -32,7 +32,9 @@ def setup_of(config: Config, laser: Laser) -> Setup:
         hold=frozenset(laser.hold),
         criteria=Criteria(
             cost_m=config.accept.cost_m,
+            left_out_m=config.accept.left_out_m,
             improvement=config.accept.improvement,
+            doubling=config.accept.doubling,
             mode=config.accept.mode,
             max_sigma=(
                 most.xy_m,
@@ -62,7 +64,9 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
             "held": sorted(setup.hold),
             "cost_m": None,
             "measured_cost_m": None,
+            "left_out_m": None,
             "improvement": None,
+            "doubling": None,
             "set_aside": [],
             "time_offset_s": 0.0,
             "extras": {},
@@ -78,7 +82,9 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
         "held": list(result.held),
         "cost_m": result.cost_m,
         "measured_cost_m": result.measured_cost_m,
+        "left_out_m": result.left_out_m,
         "improvement": result.improvement,
+        "doubling": result.doubling,
         "set_aside": [{"pass": number, "why": why} for number, why in result.set_aside.items()],
         "time_offset_s": result.extras.get("time_s", 0.0),
         "extras": {

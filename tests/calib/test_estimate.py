@@ -173,6 +173,8 @@ def test_a_time_offset_is_held_at_zero_where_every_pass_is_driven_forward_at_one
     result = calibrate(returns, rig.measured, pass_error=True, extras=["time_s"])
     assert result.extras == {}
     assert result.mount.x_m == pytest.approx(rig.true.x_m + 0.06, abs=0.01), "it looks like x"
+    assert result.sigma.x_m == pytest.approx(0.03, abs=0.005), "10 ms are 3 cm at 3 m/s"
+    assert any(reason.startswith("x is known to ±") for reason in result.verdict.reasons)
 
 
 def test_a_time_offset_is_told_from_x_by_passes_in_reverse(rig):

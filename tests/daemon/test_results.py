@@ -110,6 +110,8 @@ def test_the_configuration_becomes_the_set_up(settings):
         accept={
             "cost_m": 0.04,
             "improvement": 0.01,
+            "left_out_m": 0.045,
+            "doubling": 0.03,
             "mode": "any",
             "max_sigma": {"xy_m": 0.01, "z_m": 0.02, "roll_deg": 0.3, "pitch_deg": 0.4, "yaw_deg": 0.5},
         },
@@ -120,6 +122,7 @@ def test_the_configuration_becomes_the_set_up(settings):
     assert setup.measured_sigma == Mount(0.03, 0.03, 0.03, 2.0, 2.0, 2.0)
     assert (setup.pole_radius_m, setup.hold) == (0.04, {"z", "roll"})
     assert (setup.criteria.cost_m, setup.criteria.improvement, setup.criteria.mode) == (0.04, 0.01, "any")
+    assert (setup.criteria.left_out_m, setup.criteria.doubling) == (0.045, 0.03)
     assert setup.criteria.max_sigma[:3] == (0.01, 0.01, 0.02)
     assert np.degrees(setup.criteria.max_sigma[3:]) == pytest.approx([0.3, 0.4, 0.5])
     need = setup.need
