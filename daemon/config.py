@@ -272,10 +272,14 @@ class Accept(_Part):
 
 
 class Storage(_Part):
-    """How much of the disk the sessions may take (MB of 10⁶ bytes): the oldest that were not accepted go."""
+    """How much of the disk the sessions may take (MB of 10⁶ bytes): the oldest that were not accepted go.
+
+    ``decoded`` captures can be looked at in robot tools: scans, fixes, frames and clouds are in them.
+    """
 
     min_free_mb: Annotated[int, Field(ge=1)] = 200
     quota_mb: Annotated[int, Field(ge=1)] | None = None
+    decoded: bool = True
 
 
 class Config(_Part):

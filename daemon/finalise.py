@@ -1,7 +1,10 @@
-"""A closed or cut-off capture to an indexed, compressed one with the same messages; the old file until then.
+"""A closed or cut-off capture to an indexed, compressed one with the same messages, and what they mean.
 
-A process of its own does it (``python -m polecal.daemon.finalise CAPTURE``), so that it takes neither the
-interpreter nor the memory of a run that may be under way. Whatever goes wrong, the file stays as it was.
+Beside what was recorded it has messages that robot tools show (`decoded`), unless there is no room for them
+or something is wrong with them: they can be had again, what was recorded cannot. The old file is there until
+the new one is; whatever goes wrong, it stays as it was. A process of its own does it (``python -m
+polecal.daemon.finalise CAPTURE``), so that it takes neither the interpreter nor the memory of a run that may
+be under way.
 """
 
 from __future__ import annotations
@@ -16,9 +19,10 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -30,6 +34,7 @@ from mcap.writer import CompressionType, Writer
 
 from polecal import PolecalError, __version__
 from polecal.daemon import recorder, reporting
+from polecal.daemon.decoded import Decoder
 from polecal.daemon.recorder import METADATA, RecorderError
 from polecal.daemon.sessions import CAPTURE
 
@@ -37,6 +42,8 @@ REPAIR = "polecal.repair"
 """The metadata record of a capture that was not closed by the daemon that wrote it."""
 
 _PART, _DAMAGED = ".part", ".damaged"
+_DECODED = "decoded"
+_LOOK_EVERY = 500  # messages: a few seconds of a capture
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +55,14 @@ class Finalised:
     size_bytes: tuple[int, int]
     """Before and after."""
     recovered: str | None
+    decoded: int
+    """How many messages were added that robot tools show."""
+    not_decoded: str | None
+    """Why there are none, None where there are."""
+
+
+class _NotDecoded(Exception):
+    """What was recorded must do without what it means; the message says why."""
 
 
 def is_indexed(path: Path) -> bool:
@@ -60,8 +75,8 @@ def is_indexed(path: Path) -> bool:
     return summary is not None and bool(summary.chunk_indexes)
 
 
-def finalise(path: Path, leave_bytes: int = 0) -> Finalised:
-    """Rewrite a capture indexed and compressed, all that is whole in it.
+def finalise(path: Path, leave_bytes: int = 0, *, decoded: bool = True) -> Finalised:
+    """Rewrite a capture indexed and compressed, all that is whole in it; ``decoded``, with what it means.
 
     The new file has its own name until it is on the disk and was read back. A damaged original is kept
     beside it, as more may be found in it by hand. ``leave_bytes`` must stay free on the disk meanwhile.
@@ -76,12 +91,12 @@ def finalise(path: Path, leave_bytes: int = 0) -> Finalised:
             free_bytes = shutil.disk_usage(path.parent).free
             if free_bytes - capture.size_bytes < leave_bytes:
                 raise OSError(errno.ENOSPC, "too little room on the disk")
-            count, size_bytes = _replace(capture)
+            done = _replace(capture, leave_bytes, decoded=decoded)
             os.fsync(folder)
     except OSError as error:
         hint = "see that the disk is there and has room; the next start tries again"
         raise RecorderError(f"{path}: cannot be indexed: {error.strerror}", hint) from error
-    return Finalised(str(path), count, (capture.size_bytes, size_bytes), capture.cut)
+    return done
 
 
 @contextmanager
@@ -95,18 +110,19 @@ def _alone(path: Path) -> Iterator[int]:
         os.close(folder)
 
 
-def _replace(capture: recorder.Capture) -> tuple[int, int]:
-    """Put the rewritten capture in the old one's place; give its messages and bytes."""
+def _replace(capture: recorder.Capture, leave_bytes: int, *, decoded: bool) -> Finalised:
+    """Put the rewritten capture in the old one's place."""
     path = capture.path
     part = path.with_name(f".{path.name}{_PART}")
+    why = None if decoded else "it is not asked for"
     try:
-        with part.open("wb") as file:
-            count, written = _rewrite(capture, file)
-            file.flush()
-            os.fsync(file.fileno())
-        after = recorder.read(part)
-        if _digest(after) != written or after.cut is not None:
-            raise RecorderError(f"{path}: was not read back as it was written", "look at the disk's health")
+        if why is None:
+            try:
+                messages, more = _write(capture, part, leave_bytes)
+            except (OSError, RecorderError, _NotDecoded) as error:
+                why = error.strerror or str(error) if isinstance(error, OSError) else str(error)
+        if why is not None:
+            messages, more = _write(capture, part, None)
         if capture.damaged:
             os.link(path, path.with_name(path.name + _DAMAGED))
         size_bytes = part.stat().st_size
@@ -114,28 +130,83 @@ def _replace(capture: recorder.Capture) -> tuple[int, int]:
     finally:
         with suppress(OSError):
             part.unlink()
-    return count, size_bytes
+    return Finalised(str(path), messages, (capture.size_bytes, size_bytes), capture.cut, more, why)
 
 
-def _rewrite(capture: recorder.Capture, file: IO[bytes]) -> tuple[int, bytes]:
-    """Copy a capture; give how many messages it has, and their digest."""
+def _write(capture: recorder.Capture, part: Path, leave_bytes: int | None) -> tuple[int, int]:
+    """Write a capture to ``part`` and read it back; decoded, too, unless ``leave_bytes`` is None.
+
+    Gives how many messages were recorded, and how many decoded. Raises OSError, RecorderError, _NotDecoded.
+    """
+    with part.open("wb") as file:
+        copied, more, written = _rewrite(capture, file, leave_bytes)
+        file.flush()
+        os.fsync(file.fileno())
+    after = recorder.read(part)
+    if _digest(after) != written or after.cut is not None:
+        raise RecorderError(
+            f"{capture.path}: was not read back as it was written", "look at the disk's health"
+        )
+    return copied, more
+
+
+def _rewrite(capture: recorder.Capture, file: IO[bytes], leave_bytes: int | None) -> tuple[int, int, bytes]:
+    """Copy a capture; give how many messages it has, how many were added, and the digest of the first."""
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(library=f"polecal {__version__}")
     writer.add_metadata(METADATA, capture.metadata)
     channels: dict[int, int] = {}
-    digest, count = hashlib.sha256(), 0
-    for channel, message, _ in capture.messages():
-        if channel.id not in channels:
-            channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, 0)
-        writer.add_message(
-            channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
-        )
-        digest.update(_identity(channel, message))
-        count += 1
+    digest, copied = hashlib.sha256(), 0
+    with _decoding(capture, writer, leave_bytes) as decode:
+        for channel, message, item in capture.messages():
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, 0)
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+            )
+            digest.update(_identity(channel, message))
+            copied += 1
+            decode(item)
+        more = decode(None)
     if capture.cut is not None:
         writer.add_metadata(REPAIR, {"recovered": capture.cut})
     writer.finish()  # type: ignore[no-untyped-call]
-    return count, digest.digest()
+    return copied, more, digest.digest()
+
+
+@contextmanager
+def _decoding(
+    capture: recorder.Capture, writer: Writer, leave_bytes: int | None
+) -> Iterator[Callable[[recorder.Record | recorder.Event | None], int]]:
+    """Give what takes each item, and None for the end, and writes what they mean; it counts what it wrote.
+
+    Raises _NotDecoded, also for a bug in it: nothing may cost what was recorded.
+    """
+    if leave_bytes is None:
+        yield lambda _: 0
+        return
+    folder, taken = capture.path.parent, count(1)
+
+    def decode(item: recorder.Record | recorder.Event | None) -> int:
+        if next(taken) % _LOOK_EVERY == 0 and shutil.disk_usage(folder).free < leave_bytes:
+            raise _NotDecoded("too little room on the disk")
+        try:
+            if item is None:
+                decoder.finish()
+            else:
+                decoder.take(item)
+        except Exception as error:
+            raise _NotDecoded(f"{error!r}") from error
+        return decoder.count
+
+    try:
+        decoder = Decoder(capture.metadata, folder, writer)
+    except Exception as error:
+        raise _NotDecoded(str(error)) from error
+    try:
+        yield decode
+    finally:
+        decoder.close()
 
 
 def _digest(capture: recorder.Capture) -> bytes:
@@ -156,9 +227,9 @@ class Finaliser:
     What it does not come to, the next start of the daemon does.
     """
 
-    def __init__(self, state_dir: Path, leave_bytes: int = 0) -> None:
+    def __init__(self, state_dir: Path, leave_bytes: int = 0, *, decoded: bool = True) -> None:
         """Prepare to finalise what an earlier daemon left, not indexed yet or cut off."""
-        self._leave_bytes = leave_bytes
+        self._how = [str(leave_bytes), *([_DECODED] if decoded else [])]
         self._queue: queue.Queue[tuple[Path, bool] | None] = queue.Queue()
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
@@ -225,7 +296,7 @@ class Finaliser:
 
     def _run(self, path: Path) -> None:
         """Finalise in a child process, unless closed."""
-        ended = self._child_of([sys.executable, "-m", __spec__.name, str(path), str(self._leave_bytes)])
+        ended = self._child_of([sys.executable, "-m", __spec__.name, str(path), *self._how])
         if ended is None:
             return
         code, said, trouble = ended
@@ -252,7 +323,7 @@ def main(argv: list[str]) -> int:
     """Finalise one capture; say on standard output what became of it, or on stderr why it stays."""
     os.nice(10)
     try:
-        done = finalise(Path(argv[0]), int(argv[1]))
+        done = finalise(Path(argv[0]), int(argv[1]), decoded=_DECODED in argv)
     except PolecalError as error:
         sys.stderr.write(f"{error}\n")
         return 1

@@ -230,7 +230,9 @@ def _serve(path: str, config: Config) -> int:
                 Code.NOT_PERMITTED if isinstance(error, PermissionError) else Code.CONFIG,
             ) from error
     manager = Manager()
-    finaliser = Finaliser(config.state_dir, config.storage.min_free_mb * 1_000_000)
+    finaliser = Finaliser(
+        config.state_dir, config.storage.min_free_mb * 1_000_000, decoded=config.storage.decoded
+    )
     service = Service(config, finaliser.add)
     with ControlServer(config.socket, service), finaliser:
         structlog.get_logger().info("ready", socket=str(config.socket), release=__version__)

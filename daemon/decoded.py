@@ -1,0 +1,333 @@
+"""A capture's chunks to messages that robot tools show: scans, fixes, frames, clock, and each pass's cloud.
+
+They are what the pipeline made of the chunks, which are played through it once more. In the capture they
+are beside the chunks and have the same log time, CLOCK_MONOTONIC; the time within each is UTC.
+
+| topic | schema | |
+|---|---|---|
+| /NAME/scan | foxglove.LaserScan | every scan of a laser; stamped with the mean time of its beams |
+| /NAME/points/measured, …/calibrated | foxglove.PointCloud | a pass's pole and ground, by either mount |
+| /span/fix | foxglove.LocationFix | 20 a second, and whether the pose is trusted |
+| /tf | foxglove.FrameTransform | the body while its pose is trusted, 20 a second; each laser on it |
+| /clock | polecal.Clock | what time it is, once a second |
+| /pole_pass | polecal.PolePass | a pass in numbers |
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import IO, Any, Self
+
+import numpy as np
+import pymap3d
+import yaml
+from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
+
+from polecal.calib import Kind, Mount, Returns, cost, points_nav
+from polecal.calib.geometry import roll_pitch_yaw, rotation
+from polecal.daemon import config as configuration
+from polecal.daemon import foxglove
+from polecal.daemon.config import SPAN
+from polecal.daemon.passes import StoredPass
+from polecal.daemon.pipeline import Pipeline
+from polecal.daemon.recorder import Event, Record, RecorderError
+from polecal.daemon.replay import play
+from polecal.daemon.sessions import CALIBRATION
+from polecal.drivers.novatel_span import NavState
+from polecal.drivers.sick_lms import Decoded, beam_ages_s
+
+METADATA = "polecal.decoded"
+"""The metadata record that says what the frames are, and which calibration the clouds are shown by."""
+
+_POSE_NS = 50_000_000
+_CLOCK_NS = 1_000_000_000
+_NAMES = ("range_m", "bearing_rad", "position_m", "rpy_rad", "velocity_mps", "rate_radps", "kind")
+
+_TIME = {
+    "type": "object",
+    "title": "time",
+    "properties": {
+        "sec": {"type": "integer"},
+        "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+    },
+    "required": ["sec", "nsec"],
+}
+_COUNT = {"type": "integer", "minimum": 0}
+_METRES = {"type": "number", "minimum": 0}
+CLOCK = {
+    "title": "polecal.Clock",
+    "type": "object",
+    "properties": {
+        "host": _TIME | {"description": "CLOCK_MONOTONIC of the host: the clock of every log time"},
+        "utc": _TIME | {"description": "the same moment in UTC, Unix time"},
+        "gps": {"anyOf": [_TIME, {"type": "null"}], "description": "since 1980-01-06; null while not known"},
+        "source": {
+            "enum": ["receiver", "host"],
+            "description": "what UTC is by; the host's was read once, when the session began",
+        },
+    },
+    "required": ["host", "utc", "gps", "source"],
+}
+POLE_PASS = {
+    "title": "polecal.PolePass",
+    "type": "object",
+    "properties": {
+        "laser": {"type": "string"},
+        "id": {"type": "integer"},
+        "place": {"type": "integer", "description": "which reflector it was: passes of one have the same"},
+        "begin": _TIME | {"description": "UTC of its first return"},
+        "end": _TIME | {"description": "UTC of its last return"},
+        "heading_deg": {"type": "number", "description": "mean azimuth of the body"},
+        "speed_mps": {"type": "number", "description": "mean, forward; negative in reverse"},
+        "nearest_m": _METRES | {"description": "the shortest range to the pole"},
+        "returns": {
+            "type": "object",
+            "properties": {"pole": _COUNT, "ground": _COUNT},
+            "required": ["pole", "ground"],
+        },
+        "slices": {
+            "type": "object",
+            "additionalProperties": _COUNT,
+            "description": "pole returns by slice of platform yaw",
+        },
+        "measured_cost_m": _METRES
+        | {"description": "√c of Eq. 7 of this pass alone, by the mount as measured"},
+        "cost_m": {"anyOf": [_METRES, {"type": "null"}], "description": "the same, by the calibrated one"},
+    },
+    "required": [
+        *(
+            "laser",
+            "id",
+            "place",
+            "begin",
+            "end",
+            "heading_deg",
+            "speed_mps",
+            "nearest_m",
+            "returns",
+            "slices",
+        ),
+        *("measured_cost_m", "cost_m"),
+    ],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Calibrated:
+    """A mount that was found, and the offsets that were found with it."""
+
+    mount: Mount
+    time_s: float
+    range_m: float
+
+    @classmethod
+    def of(cls, entry: dict[str, Any]) -> Self | None:
+        """Take a laser's entry of STATUS or calibration.yaml."""
+        if entry["estimate"] is None:
+            return None
+        extras = {name: found["value"] for name, found in entry["extras"].items()}
+        return cls(Mount(**entry["estimate"]), extras.get("time_s", 0.0), extras.get("range_m", 0.0))
+
+    def apply(self, returns: Returns) -> Returns:
+        """Give returns at the pose, and with the range, that the calibration takes them to have."""
+        assert returns.velocity_mps is not None
+        assert returns.rate_radps is not None
+        turned = (
+            rotation(returns.rpy_rad) @ Rotation.from_rotvec(returns.rate_radps * self.time_s).as_matrix()
+        )
+        return replace(
+            returns,
+            range_m=returns.range_m + np.where(returns.kind == Kind.POLE, self.range_m, 0.0),
+            position_m=returns.position_m + returns.velocity_mps * self.time_s,
+            rpy_rad=roll_pitch_yaw(turned),
+        )
+
+
+class Decoder:
+    """Takes a capture's items in their order, and writes what they mean into an MCAP file.
+
+    Passes wait in a file without a name in ``folder``: their clouds are shown by a calibration that is known
+    at the end only. It is the one of ``folder`` where there is one of this session, else what it comes to.
+    """
+
+    def __init__(self, metadata: dict[str, str], folder: Path, writer: Writer) -> None:
+        """Begin with a capture's metadata. Raises RecorderError, ConfigError, OSError."""
+        lacking = ", ".join(key for key in ("session", "created", "config") if key not in metadata)
+        if lacking:
+            raise RecorderError(f"the capture does not say its {lacking}", "it was not made by a session")
+        self._config = configuration.loads(metadata["config"], "the capture's configuration")
+        self._session, self._folder, self._writer = metadata["session"], folder, writer
+        self._created_ns = round(datetime.fromisoformat(metadata["created"]).timestamp()) * 10**9
+        self._channels = foxglove.Channels(writer)
+        self._lasers = {laser.name: laser for laser in self._config.lasers}
+        self._age_ns = {
+            laser.name: round(
+                1e9
+                * beam_ages_s(
+                    laser.fov_deg, laser.resolution_deg, round(laser.fov_deg / laser.resolution_deg) + 1
+                ).mean()
+            )
+            for laser in self._config.lasers
+        }
+        self._pipeline = Pipeline(
+            self._config,
+            on_pass=self._keep,
+            on_scan=self._scan,
+            on_pose=self._pose,
+        )
+        self._origin: tuple[float, float, float] | None = None
+        self._now_ns = self._pose_ns = 0
+        self._first_ns: int | None = None
+        self._clock_ns: int | None = None
+        self._kept: list[tuple[str, StoredPass]] = []  # without their returns, which are in the file
+        self._returns: IO[bytes] = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - until closed
+
+    @property
+    def count(self) -> int:
+        """How many messages were written."""
+        return self._channels.count
+
+    def close(self) -> None:
+        """Let go of what waits."""
+        self._returns.close()
+
+    def take(self, item: Record | Event) -> None:
+        """Write what came to be known by an item."""
+        self._now_ns = item.t_ns
+        if self._first_ns is None:
+            self._first_ns = item.t_ns
+        play(self._pipeline, item)
+        if self._clock_ns is None or item.t_ns - self._clock_ns >= _CLOCK_NS:
+            self._clock_ns = item.t_ns
+            gps_ns = self._pipeline.gps_ns(item.t_ns)
+            content = {
+                "host": _time(item.t_ns),
+                "utc": _time(self._utc_ns(item.t_ns)),
+                "gps": None if gps_ns is None else _time(gps_ns),
+                "source": "host" if gps_ns is None else "receiver",
+            }
+            self._channels.put_json("/clock", item.t_ns, CLOCK, content)
+
+    def finish(self) -> None:
+        """Write what is known at the end only: the lasers' frames, and the passes."""
+        self._pipeline.finish(self._now_ns, "the capture ends here")
+        state, entries = self._calibration()
+        about = {"frames": foxglove.FRAMES, "state": state, "leap_s": str(foxglove.LEAP_S)}
+        first_ns = self._first_ns or 0
+        stamp_ns = self._utc_ns(first_ns)
+        found: dict[str, _Calibrated | None] = {}
+        for name, laser in self._lasers.items():
+            found[name] = best = _Calibrated.of(entries[name]) if name in entries else None
+            mounts = {"measured": Mount(**laser.mount.model_dump())}
+            if best is not None:
+                mounts["calibrated"] = best.mount
+                about[f"{name}/calibrated"] = json.dumps(
+                    {key: entries[name][key] for key in ("estimate", "sigma", "held", "extras", "verdict")}
+                )
+            for how, mount in mounts.items():
+                self._channels.put("/tf", first_ns, foxglove.sensor_on_body(stamp_ns, f"{name}/{how}", mount))
+            self._channels.put("/tf", first_ns, foxglove.same_frame(stamp_ns, f"{name}/{how}", name))
+        self._returns.seek(0)
+        for name, stored in self._kept:
+            self._write_pass(name, stored, found[name])
+        self._writer.add_metadata(METADATA, about)
+
+    def _calibration(self) -> tuple[str, dict[str, dict[str, Any]]]:
+        """Give the state that the run came to, and each laser's entry."""
+        try:
+            said = yaml.safe_load((self._folder / CALIBRATION).read_text(encoding="utf-8"))
+            if all(entry["session"] == self._session for entry in said["lasers"]):
+                return said["state"], {entry["name"]: entry for entry in said["lasers"]}
+        except FileNotFoundError:
+            pass
+        status = self._pipeline.status()
+        return status["state"], {entry["name"]: entry for entry in status["lasers"]}
+
+    def _scan(self, laser: str, stx_ns: int, scan: Decoded) -> None:
+        stamp_ns = self._utc_ns(stx_ns - self._age_ns[laser])
+        message = foxglove.laser_scan(stamp_ns, laser, self._lasers[laser].fov_deg, scan)
+        self._channels.put(f"/{laser}/scan", self._now_ns, message)
+
+    def _pose(self, pose: NavState, used: bool) -> None:
+        place = (pose.lat_deg, pose.lon_deg, pose.height_m)
+        if used and self._origin is None:
+            self._origin = place  # as the trajectory's
+        if not pose.good or 0 <= pose.gps_ns - self._pose_ns < _POSE_NS:
+            return
+        self._pose_ns = pose.gps_ns
+        self._channels.put(f"/{SPAN}/fix", self._now_ns, foxglove.location_fix(pose, used=used))
+        if used and self._origin is not None:
+            ned_m = [float(value) for value in pymap3d.geodetic2ned(*place, *self._origin)]
+            rpy_deg = (pose.roll_deg, pose.pitch_deg, pose.azimuth_deg)
+            stamp_ns = foxglove.utc_ns(pose.gps_ns)
+            self._channels.put("/tf", self._now_ns, foxglove.body_in_map(stamp_ns, ned_m, rpy_deg))
+
+    def _keep(self, laser: str, stored: StoredPass) -> None:
+        columns = [getattr(stored.returns, name) for name in _NAMES]
+        np.save(self._returns, np.column_stack(columns))
+        gps_ns = stored.gps_ns[[stored.gps_ns.argmin(), stored.gps_ns.argmax()]]
+        self._kept.append((laser, replace(stored, returns=stored.returns[:0], gps_ns=gps_ns)))
+
+    def _write_pass(self, laser: str, stored: StoredPass, found: _Calibrated | None) -> None:
+        returns = _returns(np.load(self._returns), stored.id)
+        measured = Mount(**self._lasers[laser].mount.model_dump())
+        radius_m = self._config.pole.radius_m
+        begin_ns, end_ns = (foxglove.utc_ns(int(gps_ns)) for gps_ns in stored.gps_ns)
+        t_ns = stored.t_ns[1]
+        topic = f"/{laser}/points"
+        cloud = foxglove.point_cloud(end_ns, points_nav(returns, measured), returns.kind)
+        self._channels.put(f"{topic}/measured", t_ns, cloud)
+        cost_m = None
+        if found is not None:
+            shifted = found.apply(returns)
+            cloud = foxglove.point_cloud(end_ns, points_nav(shifted, found.mount), returns.kind)
+            self._channels.put(f"{topic}/calibrated", t_ns, cloud)
+            cost_m = cost(shifted, found.mount, radius_m)
+        pole = returns.kind == Kind.POLE
+        assert returns.velocity_mps is not None
+        yaw_rad = returns.rpy_rad[:, 2]
+        ahead_mps = (returns.velocity_mps * rotation(returns.rpy_rad)[:, :, 0]).sum(axis=1)
+        heading_deg = np.degrees(np.arctan2(np.sin(yaw_rad).mean(), np.cos(yaw_rad).mean()))
+        content = {
+            "laser": laser,
+            "id": stored.id,
+            "place": stored.place,
+            "begin": _time(begin_ns),
+            "end": _time(end_ns),
+            "heading_deg": float(heading_deg % 360),
+            "speed_mps": float(ahead_mps.mean()),
+            "nearest_m": float(returns.range_m[pole].min()),
+            "returns": {"pole": int(pole.sum()), "ground": int((~pole).sum())},
+            "slices": {str(part): count for part, count in sorted(stored.moments.pole_returns.items())},
+            "measured_cost_m": cost(returns, measured, radius_m),
+            "cost_m": cost_m,
+        }
+        self._channels.put_json("/pole_pass", t_ns, POLE_PASS, content)
+
+    def _utc_ns(self, t_ns: int) -> int:
+        """Give the UTC of a host time: by the receiver, or by the host's own clock until that is known."""
+        gps_ns = self._pipeline.gps_ns(t_ns)
+        if gps_ns is not None:
+            return foxglove.utc_ns(gps_ns)
+        return self._created_ns + t_ns - (self._first_ns or 0)
+
+
+def _returns(table: np.ndarray[Any, np.dtype[np.float64]], pass_id: int) -> Returns:
+    """Give the returns that were kept as columns."""
+    widths = np.array([1, 1, 3, 3, 3, 3, 1])
+    parts = np.split(table, np.cumsum(widths)[:-1], axis=1)
+    values = {
+        name: part[:, 0] if width == 1 else part
+        for name, part, width in zip(_NAMES, parts, widths, strict=True)
+    }
+    kind = values.pop("kind").astype(np.uint8)
+    return Returns(**values, kind=kind, pass_id=np.full(len(kind), pass_id))
+
+
+def _time(ns: int) -> dict[str, int]:
+    return {"sec": ns // 10**9, "nsec": ns % 10**9}
