@@ -13,6 +13,7 @@ from polecal.calib.observations import (
     cost,
     points_nav,
 )
+from polecal.calib.residuals import Residual, residuals
 
 __all__ = [
     "KEYS",
@@ -23,6 +24,7 @@ __all__ = [
     "Mount",
     "Need",
     "Pass",
+    "Residual",
     "Result",
     "Returns",
     "Setup",
@@ -32,4 +34,5 @@ __all__ = [
     "cost",
     "estimate",
     "points_nav",
+    "residuals",
 ]

@@ -11,12 +11,14 @@ import grp
 import json
 import math
 import os
+import pwd
 import select
 import socket
 import stat
 import struct
 import threading
 from collections.abc import Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -43,6 +45,17 @@ _PEERCRED = struct.Struct("iII")  # struct ucred: pid, uid, gid
 _SO_PEERGROUPS = 59  # socket(7) has it since Linux 4.13, Python has no name for it
 _GROUPS_BYTES = 1024  # as many as Python's getsockopt can give, 256
 _LOGGED = 200  # characters
+_peer_uid: ContextVar[int | None] = ContextVar("peer_uid", default=None)
+
+
+def asker() -> str:
+    """Give the user whose request is being answered; this process's own where it came by no socket."""
+    uid = _peer_uid.get()
+    uid = os.getuid() if uid is None else uid
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"uid {uid}"
 
 
 class Code(IntEnum):
@@ -293,6 +306,7 @@ class ControlServer:
         seen: set[str] = set()
         try:
             peer = Peer.of(connection)
+            _peer_uid.set(peer.uid)  # this thread serves nobody else
             log = log.bind(pid=peer.pid, uid=peer.uid)
             log.debug("client connected")
             lines.write({"class": "VERSION", "release": __version__, "proto": list(PROTO)})

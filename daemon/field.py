@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from io import BufferedReader
 from pathlib import Path
@@ -18,9 +18,10 @@ from typing import Any, NoReturn, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from polecal import PolecalError, __version__
-from polecal.daemon import control
+from polecal.daemon import control, tables
 from polecal.daemon.control import Client, Code, Refused
 from polecal.daemon.routine import State
 from polecal.daemon.screen import Screen
@@ -32,6 +33,7 @@ _SOCKET = "/run/polecal/control.sock"
 _CONFIG = "/etc/polecal/polecal.yaml"
 _STATUS_S = 1.0
 _ANSWER_S = 10.0
+_LIST_S = 30.0  # a session of many passes may have to be calibrated again
 _START_S = 300.0  # a device search tries every rate, twice, and may write an EEPROM
 _REPORT_S = 600.0  # hours of driving to read through, at a low priority
 _STOP_S = 120.0  # the devices are left polite, and what there is may be calibrated
@@ -88,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
 
     start = verb(_start, "begin a session; returns once every device streams")
     start.add_argument("--name", help="goes into the session's name")
+    start.add_argument("--continue", dest="session", metavar="SESSION", help="go on with it, on another day")
     start.add_argument("--force", action="store_true", help="also where a session is running, which ends")
     status = verb(_status, "show how it stands and what to drive next")
     status.add_argument("--watch", action="store_true", help="go on showing it, until Ctrl-C")
@@ -104,8 +107,16 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("session", nargs="?", metavar="SESSION", help="its name, or a folder's path")
     report.add_argument("--out", type=Path, metavar="FILE", help="elsewhere than into the session's folder")
     report.add_argument("--png", type=Path, metavar="DIR", help="the drawings, too, as PNG")
+    passes = verb(_passes, "list a session's passes, by default the present or last one's")
+    passes.add_argument("session", nargs="?", metavar="SESSION")
+    for done in (_drop, _keep):
+        about = "leave a pass out" if done is _drop else "take a pass back"
+        chosen = verb(done, f"{about}, calibrate again, and show what changed")
+        chosen.add_argument("name", metavar="PASS", help="like 7, or like front-007")
+        chosen.add_argument("--session", metavar="SESSION", help="by default the present or last one")
+    verb(_sessions, "list the sessions")
     replay = verb(_replay, "run a capture through the whole pipeline again, without a daemon")
-    replay.add_argument("capture", type=Path, metavar="CAPTURE")
+    replay.add_argument("capture", type=Path, metavar="CAPTURE", help="or its session's folder")
     replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
     replay.add_argument("--out", type=Path, metavar="DIR", help="where calibration and passes go")
     imported = verb(_import, "make a capture of raw serial dumps, for replay")
@@ -141,6 +152,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _start(arguments: argparse.Namespace) -> int:
     request = {"class": "START", "name": arguments.name, "force": arguments.force}
+    if arguments.session is not None:
+        request["continue"] = arguments.session
     answers: list[dict[str, Any] | PolecalError] = []
 
     def ask() -> None:
@@ -305,6 +318,56 @@ def _report(arguments: argparse.Namespace) -> int:
     else:
         print(answer["path"])
     return 0
+
+
+def _passes(arguments: argparse.Namespace) -> int:
+    answer = _whole(arguments, {"class": "PASSES", "session": arguments.session}, "passes")
+    _tell(answer, arguments, tables.passes)
+    return 0
+
+
+def _sessions(arguments: argparse.Namespace) -> int:
+    _tell(_whole(arguments, {"class": "SESSIONS"}, "sessions"), arguments, tables.sessions)
+    return 0
+
+
+def _whole(arguments: argparse.Namespace, request: dict[str, Any], rows: str) -> dict[str, Any]:
+    """Ask page by page, and give one answer with all rows."""
+    with Client(arguments.socket, _LIST_S) as client:
+        answer = client.request(request)
+        while answer["next"] is not None:
+            more = client.request(request | {"from": answer["next"]})
+            answer = answer | {rows: [*answer[rows], *more[rows]], "next": more["next"]}
+    return answer
+
+
+def _drop(arguments: argparse.Namespace) -> int:
+    return _choose(arguments, "DROP")
+
+
+def _keep(arguments: argparse.Namespace) -> int:
+    return _choose(arguments, "KEEP")
+
+
+def _choose(arguments: argparse.Namespace, what: str) -> int:
+    request = {"class": what, "pass": arguments.name, "session": arguments.session}
+    with Client(arguments.socket, _LIST_S) as client:
+        answer = client.request(request)
+    _tell(answer, arguments, tables.change)
+    return _EXIT_BY_STATE.get(answer["after"]["state"], 0)
+
+
+def _tell(
+    answer: dict[str, Any],
+    arguments: argparse.Namespace,
+    table: Callable[[Mapping[str, Any]], Iterator[Text]],
+) -> None:
+    if arguments.json:
+        _print_json(answer)
+        return
+    console = Console()
+    for line in table(answer):
+        console.print(line, soft_wrap=True)
 
 
 def _replay(arguments: argparse.Namespace) -> int:

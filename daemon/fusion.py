@@ -73,6 +73,8 @@ class LaserChannel:
         on_frame: Callable[[int], None],
         *,
         on_scan: Callable[[int, Decoded], None] | None = None,
+        site: int = 0,
+        passes_before: int = 0,
     ) -> None:
         self.dropped: Counter[str] = Counter()
         """Beams, or scans of a laser, that were not used, by reason."""
@@ -81,7 +83,7 @@ class LaserChannel:
         self.measured = Mount(**laser.mount.model_dump())
         self.mount = self.measured
         """What places returns in n: the best known so far."""
-        self._builder = PassBuilder(config.routine.slice_deg)
+        self._builder = PassBuilder(config.routine.slice_deg, site, passes_before)
         self._ground = Ground()
         self._clock = Clock(max_drift=_MIRROR_DRIFT)
         self._revolutions: tuple[int, int] | None = None  # the count so far, and its host time

@@ -17,6 +17,7 @@ import numpy as np
 
 from polecal.daemon.config import Navigation as Settings
 from polecal.daemon.pulse import Pulse
+from polecal.daemon.quality import QualityLog
 from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
 from polecal.drivers.novatel_span import (
@@ -29,7 +30,9 @@ from polecal.drivers.novatel_span import (
     MessageId,
     NavState,
     PositionType,
+    Time,
     TimeStatus,
+    UtcStatus,
     accuracy,
     nav_state,
     parse,
@@ -51,7 +54,7 @@ _SILENT_NS = 1_000_000_000
 
 _LOGS_BESIDE = frozenset(
     {
-        *(MessageId.BESTPOS, MessageId.BESTGPSPOS, MessageId.INSCONFIG),
+        *(MessageId.BESTPOS, MessageId.BESTGPSPOS, MessageId.INSCONFIG, MessageId.TIME),
         *(MessageId.INSPVAX, MessageId.INSSTDEV, MessageId.INSSTDEVS, MessageId.INSCOV, MessageId.INSCOVS),
     }
 )
@@ -156,6 +159,7 @@ class Navigation:
         """Of the poses, used or not."""
         self.clock = Clock(max_drift=_RECEIVER_DRIFT)
         self.trajectory = Trajectory(1.0 / settings.rate_hz)
+        self.quality = QualityLog()
         self.ins_status: InsStatus | int | None = None
         self.position_type: PositionType | int | None = None
         self.reference_point = reference_point(None)
@@ -249,6 +253,8 @@ class Navigation:
     def _note(self, t_ns: int, said: object) -> None:
         if isinstance(said, InsConfig):
             self.reference_point = reference_point(said)
+        if isinstance(said, Time) and said.utc_status == UtcStatus.VALID:
+            self.quality.utc_offset_s = said.utc_offset_s
         if (told := accuracy(said)) is not None:
             self._accuracy = t_ns, told
         if (rests_on := position_type(said)) is not None:
@@ -271,6 +277,9 @@ class Navigation:
         if pose.good and not any(fault.kind == TIME for fault in faults):
             self.clock.update(pose.gps_ns, left_ns)
         used = self._trust.judge(t_ns, faults)
+        rests_on = self._type[1] if self._type is not None else None
+        told = self._accuracy[1] if self._accuracy is not None else None
+        self.quality.add(pose.gps_ns, used, pose.ins_status, rests_on, told)
         if used:
             self._used_ns = t_ns
             self.trajectory.add(pose)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,35 @@ from numpy.typing import NDArray
 from polecal.calib import Kind, Mount, Pass, Returns, points_nav
 from polecal.calib.estimate import split
 from polecal.calib.segment import even_ground
+from polecal.daemon import facts
+from polecal.daemon.facts import Facts
+from polecal.daemon.quality import Quality
 from polecal.daemon.trajectory import Poses
 
 _OUT_OF_VIEW_NS = 1_500_000_000
 _LONGEST_NS = 60_000_000_000  # bounds what is kept of a vehicle that never turns away
 _FEWEST_POLE_RETURNS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What stays of a closed pass in memory: all but its returns."""
+
+    place: int
+    t_ns: tuple[int, int]
+    moments: Pass
+    facts: Facts
+    quality: Quality
+
+    @property
+    def id(self) -> int:
+        """The pass's number, from 1 on over all days of a session."""
+        return self.moments.id
+
+    @property
+    def where(self) -> tuple[int, int]:
+        """Which reflector it is of: site and place."""
+        return self.moments.site, self.place
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +53,13 @@ class StoredPass:
     """(N,) GPS time of each return."""
     returns: Returns
     moments: Pass
+    facts: Facts
+    quality: Quality = field(default_factory=Quality)
+
+    @property
+    def kept(self) -> Kept:
+        """The pass without its returns."""
+        return Kept(self.place, self.t_ns, self.moments, self.facts, self.quality)
 
 
 @dataclass(slots=True)
@@ -41,13 +72,14 @@ class _Open:
 class PassBuilder:
     """Collects returns place by place, and closes a pass once its place has not been seen for a while."""
 
-    def __init__(self, slice_deg: int) -> None:
+    def __init__(self, slice_deg: int, site: int = 0, count: int = 0) -> None:
+        """Begin without any pass; those of ``site`` are numbered on from ``count``."""
         self.too_short = 0
         self.uneven = 0
         """Ground returns left out, as they stood out of the ground."""
         self._slice_deg = slice_deg
         self._open: dict[int, _Open] = {}
-        self._count = 0
+        self._site, self._count = site, count
 
     def add(
         self,
@@ -92,7 +124,8 @@ class PassBuilder:
                     t_ns=(one.first_ns, one.last_ns),
                     gps_ns=gps_ns,
                     returns=returns,
-                    moments=Pass(self._count, split(returns, self._slice_deg)),
+                    moments=Pass(self._count, split(returns, self._slice_deg), self._site),
+                    facts=facts.of(returns, gps_ns),
                 )
             )
         return closed

@@ -6,21 +6,26 @@ What it gives depends on nothing but the configuration and the chunks, in their 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from polecal.calib import CalibrationError, Mount, Pass, Result, estimate
+from polecal.calib import CalibrationError, Mount, Pass, Result, estimate, residuals
 from polecal.calib.coverage import headings
 from polecal.calib.geometry import wrap
-from polecal.daemon import results
+from polecal.daemon import results, rows
+from polecal.daemon.choices import Choice, meant, parse_name
+from polecal.daemon.choices import name_of as pass_name
 from polecal.daemon.config import SPAN, Config, Laser
+from polecal.daemon.control import Code, Refused
 from polecal.daemon.fusion import LaserChannel
 from polecal.daemon.navigation import Navigation, OnPose, name_of
-from polecal.daemon.passes import StoredPass
+from polecal.daemon.passes import Kept, StoredPass
+from polecal.daemon.past import Past
 from polecal.daemon.pulse import Pulse
 from polecal.daemon.routine import OnTransition, Routine, State
 from polecal.daemon.trajectory import Trajectory
@@ -48,41 +53,75 @@ class _LaserRun:
         on_scan: OnScan | None,
     ) -> None:
         self.name = laser.name
-        self.pulse = Pulse()
         self.setup = results.setup_of(config, laser)
-        self.channel = LaserChannel(
-            laser,
-            config,
-            trajectory,
-            gps_clock,
-            self.pulse.beat,
-            on_scan=partial(on_scan, laser.name) if on_scan is not None else None,
-        )
+        self._on_scan = partial(on_scan, laser.name) if on_scan is not None else None
         self.result: Result | None = None
         self.costs_m: deque[float] = deque(maxlen=_COSTS)
-        self._passes: dict[int, list[Pass]] = {}  # by place
+        self.passes: list[Kept] = []
+        """All that were closed, in their order, of the pole or of another reflector."""
+        self.dropped: dict[int, Choice] = {}
+        """Passes that the operator does not want, by id."""
+        self._config, self._laser = config, laser
+        self._earlier_poles: set[tuple[int, int]] = set()
+        self.anew(0, trajectory, gps_clock)
+
+    def anew(self, site: int, trajectory: Trajectory, gps_clock: Clock) -> None:
+        """Begin to listen anew, on another day; what was learnt of the pole's place is of no use."""
+        self._site = site
+        self.pulse = Pulse()
+        self.costs_m.clear()
+        count = max((one.id for one in self.passes), default=0)
+        self.channel = LaserChannel(
+            *(self._laser, self._config, trajectory, gps_clock, self.pulse.beat),
+            on_scan=self._on_scan,
+            site=site,
+            passes_before=count,
+        )
+
+    def remember(self, passes: Iterable[Kept], poles: Collection[tuple[int, int]]) -> None:
+        """Take passes of earlier days, and which (site, place) of theirs could be the pole."""
+        self.passes = list(passes)
+        self._earlier_poles = set(poles)
 
     def take(self, stored: StoredPass) -> None:
-        self._passes.setdefault(stored.place, []).append(stored.moments)
+        self.passes.append(stored.kept)
         self.estimate(everywhere=False)
         if self.result is not None:
             self.costs_m.append(round(self.result.cost_m, 5))
 
     def estimate(self, *, everywhere: bool) -> None:
-        """Calibrate on the passes of the pole: the thin reflector seen most evenly from all sides."""
-        could_be = [
-            passes for place, passes in self._passes.items() if self.channel.places.could_be_pole(place)
-        ]
-        if not could_be:
-            self.result = None  # what was thin from one side has turned out to be a plate
-            return
-        passes = max(could_be, key=self._progress)
-        try:
+        """Calibrate on the passes of the pole, less what was dropped."""
+        poles = self.poles()
+        passes = [one.moments for one in self.passes if one.where in poles and one.id not in self.dropped]
+        self.result, self.channel.mount = None, self.setup.measured
+        if not passes:
+            return  # what was thin from one side has turned out to be a plate, or all were dropped
+        with suppress(CalibrationError):
             self.result = estimate(passes, self.setup, everywhere=everywhere)
-        except CalibrationError:
-            return
-        # One pass over level ground may put the laser anywhere; what is placed by that is lost.
-        self.channel.mount = self.result.mount if self._could_be(self.result.mount) else self.setup.measured
+            # One pass over level ground may put the laser anywhere; what is placed by that is lost.
+            if self._could_be(self.result.mount):
+                self.channel.mount = self.result.mount
+
+    def reflectors(self) -> dict[tuple[int, int], list[Kept]]:
+        """Give the passes of each reflector that could be the pole, by (site, place)."""
+        every: dict[tuple[int, int], list[Kept]] = {}
+        for one in self.passes:
+            every.setdefault(one.where, []).append(one)
+        return {where: passes for where, passes in every.items() if self._could_be_pole(*where)}
+
+    def poles(self) -> set[tuple[int, int]]:
+        """Give the (site, place) of each day's pole: the thin reflector seen most evenly from all sides."""
+        best: dict[int, tuple[int, tuple[int, int]]] = {}
+        for where, passes in self.reflectors().items():
+            progress = self._progress(one.moments for one in passes if one.id not in self.dropped)
+            if where[0] not in best or progress > best[where[0]][0]:
+                best[where[0]] = progress, where
+        return {where for _, where in best.values()}
+
+    def _could_be_pole(self, site: int, place: int) -> bool:
+        if site == self._site:
+            return self.channel.places.could_be_pole(place)
+        return (site, place) in self._earlier_poles
 
     def _could_be(self, mount: Mount) -> bool:
         """Say whether the hand measurement could be so wrong; if it is not absurd, let the data lead."""
@@ -120,16 +159,61 @@ class Pipeline:
         self.routine = Routine(on_transition)
         self._session, self._created = session, created
         self._on_pass = on_pass
+        self._config = config
         self._need = config.routine
+        self._on_pose = on_pose
+        self._site = 0
+        self._choices: list[Choice] = []
+        self._reference_point: Any = None  # of a session that was reopened
         self._navigation = Navigation(config.navigation, on_pose)
         self._lasers = {
             laser.name: _LaserRun(config, laser, self._navigation.trajectory, self._navigation.clock, on_scan)
             for laser in config.lasers
         }
 
-    def begin(self, t_ns: int) -> None:
-        """Start the run at host time ``t_ns``."""
+    def begin(self, t_ns: int, past: Past | None = None) -> None:
+        """Start the run at host time ``t_ns``; with the ``past`` of a session that goes on, on its passes.
+
+        Clocks, navigation, reflectors' places and open passes are another day's: they begin anew.
+        """
+        if past is not None:
+            self.routine.to(State.IDLE, t_ns, "its next day begins")
+            self.remember(past)
+            for laser in self._lasers.values():
+                laser.estimate(everywhere=True)
         self.routine.to(State.CONNECTING, t_ns, "asked to start")
+
+    def remember(self, past: Past) -> None:
+        """Take over what is known of earlier days, in place of all that is known so far."""
+        self._site, self._reference_point = past.site, None
+        self._navigation = Navigation(self._config.navigation, self._on_pose)
+        for name, laser in self._lasers.items():
+            laser.remember(past.passes.get(name, []), past.poles.get(name, []))
+            laser.dropped = {}
+            laser.anew(past.site, self._navigation.trajectory, self._navigation.clock)
+        self._choices = []
+        for choice in past.choices:
+            self._apply(choice)
+
+    def past(self) -> Past:
+        """Give what a next day of this session takes over."""
+        lasers = self._lasers.items()
+        return Past(
+            site=self._site + 1,
+            passes={name: list(laser.passes) for name, laser in lasers},
+            poles={name: sorted(laser.reflectors()) for name, laser in lasers},
+            choices=tuple(self._choices),
+        )
+
+    def reopen(self, past: Past, t_ns: int) -> None:
+        """Stand where a session's last run ended, to look at its passes and to choose among them."""
+        self.remember(past)
+        self._site = past.site - 1  # no new day
+        for laser in self._lasers.values():
+            laser.estimate(everywhere=True)
+        if past.ended is not None:
+            self._reference_point = past.reference_point
+            self.routine.reopen(past.ended, t_ns)
 
     def feed(self, device: str, t_ns: int, data: bytes) -> None:
         """Take a chunk that was read from a device at host time ``t_ns`` (CLOCK_MONOTONIC ns).
@@ -168,6 +252,9 @@ class Pipeline:
             for stored in laser.channel.end():
                 self._take(laser, stored)
             laser.estimate(everywhere=True)
+        self._judge(t_ns)
+
+    def _judge(self, t_ns: int) -> None:
         reasons = [
             f"{laser.name}: {reason}"
             for laser in self._lasers.values()
@@ -209,9 +296,108 @@ class Pipeline:
                 return None
             lasers.append(
                 results.calibration(laser.name, laser.setup, laser.result, self._session, self._created)
-                | {"reference_point": self._navigation.reference_point}
+                | {"reference_point": self._reference_point or self._navigation.reference_point}
+                | {"reflectors": rows.reflectors(laser.reflectors(), laser.poles())}
             )
-        return {"state": str(self.routine.state), "lasers": lasers}
+        return {
+            "state": str(self.routine.state),
+            "lasers": lasers,
+            "captures": self._site + 1,
+            "choices": [choice.as_dict() for choice in self._choices],
+        }
+
+    @property
+    def choices(self) -> Sequence[Choice]:
+        """What was dropped and kept, in its order."""
+        return self._choices
+
+    def passes(self) -> list[dict[str, Any]]:
+        """Give a row a pass, laser by laser: what it is, what it is worth, and whether it is used."""
+        return [row for laser in self._lasers.values() for row in self._rows(laser)]
+
+    def _rows(self, laser: _LaserRun) -> list[dict[str, Any]]:
+        poles = laser.poles()
+        aside = laser.result.set_aside if laser.result is not None else {}
+        use = {one.id: rows.use_of(one, poles, laser.dropped, aside) for one in laser.passes}
+        used = [use[one.id][0] == rows.USED for one in laser.passes]
+        told = (
+            residuals([one.moments for one in laser.passes], used, laser.setup, laser.result)
+            if laser.result is not None
+            else {}
+        )
+        return [rows.row(laser.name, one, *use[one.id], told.get(one.id)) for one in laser.passes]
+
+    def choice(self, said: object, *, drop: bool, by: str, at: str) -> Choice:
+        """Read which pass an operator means. Raises Refused where there is none, or nothing to do."""
+        self.may_choose()
+        name, number = parse_name(said, list(self._lasers))
+        laser = self._lasers[name]
+        found = next((one for one in laser.passes if one.id == number), None)
+        if found is None:
+            there = ", ".join(pass_name(name, one.id) for one in laser.passes) or "none yet"
+            raise Refused(f"there is no pass {pass_name(name, number)}", f"there is {there}", Code.USAGE)
+        if drop == (number in laser.dropped):
+            already = laser.dropped.get(number)
+            is_so = f"was dropped already, by {already.by}" if already else "is not dropped"
+            raise Refused(f"pass {pass_name(name, number)} {is_so}", "see `polecal-field passes`", Code.USAGE)
+        return Choice(name, number, drop, by, at, found.moments.site, found.t_ns)
+
+    def may_choose(self) -> None:
+        """Raise Refused where no pass can be dropped or kept."""
+        if not self.routine.running and self.routine.state not in (State.ACCEPTED, State.REJECTED):
+            raise Refused(
+                f"nothing can be dropped or kept while the session is {self.routine.state}",
+                "it was not calibrated: go on with it by `polecal-field start --continue`",
+                Code.USAGE,
+            )
+
+    def choose(self, t_ns: int, choice: Choice) -> dict[str, Any]:
+        """Drop or keep a pass at host time ``t_ns``, and calibrate again; give what changed.
+
+        Also possible once the run has ended accepted or rejected, which it may then not stay. Raises
+        Refused where it cannot be done; nothing has changed then.
+        """
+        self.may_choose()
+        laser = self._lasers.get(choice.laser)
+        if laser is None:
+            raise Refused(
+                f"there is no laser {choice.laser}", f"there is {', '.join(self._lasers)}", Code.USAGE
+            )
+        before, dropped, choices = self._standing(laser), dict(laser.dropped), list(self._choices)
+        self._apply(choice)
+        laser.estimate(everywhere=not self.routine.running)
+        if self.routine.running:
+            self._conclude(t_ns)
+        elif laser.result is None:
+            laser.dropped, self._choices = dropped, choices
+            laser.estimate(everywhere=True)
+            raise Refused(
+                f"without pass {choice.name} there is nothing left to calibrate from",
+                "keep another one first, or drive more: `polecal-field start --continue`",
+                Code.USAGE,
+            )
+        else:
+            done = "dropped" if choice.drop else "kept"
+            self.routine.to(State.CALIBRATING, t_ns, f"pass {choice.name} is {done}")
+            self._judge(t_ns)
+        return rows.change(choice, before, self._standing(laser))
+
+    def _apply(self, choice: Choice) -> None:
+        """Note a choice, and the pass that it means."""
+        laser = self._lasers.get(choice.laser)
+        if laser is None:
+            return
+        self._choices.append(choice)
+        number = meant(choice, laser.passes)
+        if number is None:
+            return
+        if choice.drop:
+            laser.dropped[number] = choice
+        else:
+            laser.dropped.pop(number, None)
+
+    def _standing(self, laser: _LaserRun) -> dict[str, Any]:
+        return {"state": str(self.routine.state)} | self._entry(laser)
 
     def _advance(self, t_ns: int) -> None:
         state = self.routine.state
@@ -228,6 +414,7 @@ class Pipeline:
             self.routine.to(State.ALIGNING, t_ns, f"no good navigation solution for 2 s: {why}")
 
     def _take(self, laser: _LaserRun, stored: StoredPass) -> None:
+        stored = replace(stored, quality=self._navigation.quality.over(*stored.facts.gps_ns))
         if self._on_pass is not None:
             self._on_pass(laser.name, stored)
         laser.take(stored)
@@ -243,8 +430,13 @@ class Pipeline:
 
     def _entry(self, laser: _LaserRun) -> dict[str, Any]:
         dropped = {reason: count for reason, count in laser.channel.dropped.items() if count}
-        told = {"dropped": dropped, "need": asdict(laser.setup.need), "costs_m": list(laser.costs_m)}
-        return results.entry(laser.name, laser.setup, laser.result) | told
+        return results.entry(laser.name, laser.setup, laser.result) | {
+            "dropped": dropped,
+            "dropped_passes": sorted(laser.dropped),
+            "earlier_passes": sum(one.moments.site < self._site for one in laser.passes),
+            "need": asdict(laser.setup.need),
+            "costs_m": list(laser.costs_m),
+        }
 
     def _next(self) -> str:
         match self.routine.state:

@@ -30,8 +30,8 @@ _NEXT = {
     State.ALIGNING: {State.COLLECTING, State.CALIBRATING},
     State.COLLECTING: {State.ALIGNING, State.CALIBRATING},
     State.CALIBRATING: {State.ACCEPTED, State.REJECTED},
-    State.ACCEPTED: {State.CONNECTING},
-    State.REJECTED: {State.CONNECTING},
+    State.ACCEPTED: {State.CONNECTING, State.CALIBRATING},
+    State.REJECTED: {State.CONNECTING, State.CALIBRATING},
     State.FAULT: {State.CONNECTING},
 }
 
@@ -68,3 +68,7 @@ class Routine:
         old, self.state, self.since_ns = self.state, state, t_ns
         if self._on_transition is not None:
             self._on_transition(t_ns, old, state, why)
+
+    def reopen(self, state: State, t_ns: int) -> None:
+        """Stand where a run ended in another life of the daemon; nobody is told."""
+        self.state, self.since_ns = state, t_ns

@@ -6,18 +6,22 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import structlog
 
 from polecal import PolecalError
+from polecal.daemon.choices import Choice
 from polecal.daemon.config import SPAN, Config
+from polecal.daemon.control import Refused
 from polecal.daemon.passes import StoredPass
+from polecal.daemon.past import Past
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import FULL, DiskFull, Event, Record, Recorder, RecorderError
-from polecal.daemon.replay import BEGIN, FINISH, play
+from polecal.daemon.replay import BEGIN, CHOICE, FINISH, play
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.sessions import CALIBRATION, Session, SessionError
 from polecal.daemon.space import MAKE_ROOM, Space
@@ -45,10 +49,18 @@ class Run:
     """A run from its start to its end; `status` and `stop` may be called from any thread."""
 
     def __init__(
-        self, config: Config, session: Session, on_closed: Callable[[Path], None] | None = None
+        self,
+        config: Config,
+        session: Session,
+        on_closed: Callable[[Path], None] | None = None,
+        past: Past | None = None,
     ) -> None:
-        """Prepare a run; ``on_closed`` is told the capture once it is closed. Raises RecorderError."""
+        """Prepare a run; ``on_closed`` is told the capture once it is closed. Raises RecorderError.
+
+        ``past`` is of a session that goes on.
+        """
         self.session = session
+        self._past = past
         self._on_closed = on_closed
         self.ended = threading.Event()
         """Set once the devices are left, the capture is closed and the result is written."""
@@ -91,6 +103,7 @@ class Run:
         self._unwritten: list[tuple[str, Callable[[], object]]] = []  # what there was no room for
         self._write_again_s = 0.0
         self._known = self._know()
+        self._asked: dict[int, Future[dict[str, Any] | None]] = {}  # by the event that asks
         self._threads: list[threading.Thread] = []
         self._engine = threading.Thread(target=self._work, name="engine")
         self._beat_s = self._begun_s = time.monotonic()
@@ -129,9 +142,10 @@ class Run:
             if problems:
                 raise joined(problems)
             now_ns = time.monotonic_ns()
-            self._recorder.event(now_ns, {"event": BEGIN})
+            past = {} if self._past is None else {"past": self._past.as_event()}
+            self._recorder.event(now_ns, {"event": BEGIN} | past)
             with self._lock:
-                self._pipeline.begin(now_ns)
+                self._pipeline.begin(now_ns, self._past)
             undo.pop_all()
         for device, port in zip(self._devices, ports, strict=True):
             self._threads.append(threading.Thread(target=device.run, args=(port,), name=device.name))
@@ -145,6 +159,47 @@ class Run:
             finish = Event(time.monotonic_ns(), {"event": FINISH, "why": why})
             self._writer.put(finish if calibrate and problem is None else _End(why, problem))
         self.ended.wait()
+
+    def passes(self) -> list[dict[str, Any]]:
+        """Give a row a pass."""
+        with self._lock:
+            return self._pipeline.passes()
+
+    def choose(self, said: object, *, drop: bool, by: str, at: str) -> dict[str, Any]:
+        """Drop or keep a pass, also after the end; give what changed.
+
+        Raises Refused, and RecorderError or SessionError where it cannot be written: nothing has changed.
+        """
+        with self._lock:
+            choice = self._pipeline.choice(said, drop=drop, by=by, at=at)
+        if not self.ended.is_set():
+            change = self._choose_running(choice)
+            if change is not None:
+                return change
+        with self._lock:
+            if self._unwritten:
+                raise DiskFull("the result is not written yet", MAKE_ROOM)
+            now_ns = time.monotonic_ns()
+            choice = replace(choice, ended=True)  # no capture tells of it
+            change = self._pipeline.choose(now_ns, choice)
+            try:
+                self.session.write_calibration(self._pipeline.calibration() or {})
+            except SessionError:
+                self._pipeline.choose(now_ns, replace(choice, drop=not drop))
+                raise
+        return change
+
+    def _choose_running(self, choice: Choice) -> dict[str, Any] | None:
+        """Have the engine drop or keep a pass, which is an input as any; None if the run ended before it."""
+        if self._writer.full is not None:
+            raise DiskFull(f"nothing is recorded: {self._writer.full}", MAKE_ROOM)
+        event = Event(time.monotonic_ns(), {"event": CHOICE, "choice": choice.as_dict()})
+        answer = self._asked[id(event)] = Future()
+        self._writer.put(event)
+        while not self.ended.is_set():
+            with contextlib.suppress(TimeoutError):
+                return answer.result(_LOOK_S)
+        return answer.result() if answer.done() else None
 
     def status(self) -> dict[str, Any]:
         """Give the parts of STATUS that a run knows; while it calculates, those from before."""
@@ -236,6 +291,8 @@ class Run:
     def _do(self, item: object | None) -> None:
         try:
             match item:
+                case Event(content={"event": "choice"}):
+                    self._choose(item)
                 case Record() | Event():
                     self._hear(item)
                 case _End():
@@ -262,6 +319,23 @@ class Run:
             play(self._pipeline, item)
             if self.state in (State.ACCEPTED, State.REJECTED):
                 self._keep_result()
+
+    def _choose(self, event: Event) -> None:
+        """Drop or keep a pass, and answer who waits for it: also a run that has just ended may change."""
+        answer = self._asked.pop(id(event))
+        if self._recorder.closed:  # too late for the capture
+            answer.set_result(None)
+            return
+        try:
+            with self._lock:
+                choice = Choice.from_dict(event.content["choice"])
+                change = self._pipeline.choose(event.t_ns, choice)
+                if self.state in (State.ACCEPTED, State.REJECTED):
+                    self._keep_result()
+        except Refused as error:
+            answer.set_exception(error)
+        else:
+            answer.set_result(change)
 
     def _end(self, end: _End) -> None:
         if end.problem is not None:

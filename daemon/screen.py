@@ -353,8 +353,9 @@ def _spark(values: list[Any], most: int) -> str:
 
 
 def _passes(laser: Mapping[str, Any]) -> str:
-    count = laser.get("passes")
-    return f"{_count(count)} pass{'' if count == 1 else 'es'}"
+    count, earlier = laser.get("passes"), laser.get("earlier_passes")
+    told = f"{_count(count)} pass{'' if count == 1 else 'es'}"
+    return f"{told} ({_count(earlier)} of earlier days)" if earlier else told
 
 
 def _number(value: Any, digits: int, sign: str = "") -> str:

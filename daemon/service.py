@@ -11,15 +11,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import structlog
 
 from polecal import PolecalError, __version__
-from polecal.daemon import log, reporting, sessions
+from polecal.daemon import archive, log, reporting, sessions, shelf
 from polecal.daemon.config import SPAN, Config, load
-from polecal.daemon.control import Code, ControlServer, Refused, code_of
+from polecal.daemon.control import Code, ControlServer, Refused, asker, code_of
 from polecal.daemon.finalise import Finaliser
 from polecal.daemon.notify import Manager, summary
 from polecal.daemon.routine import ENDED, State
@@ -31,6 +32,8 @@ _LOOK_S = 0.1
 _TELL_S = 1.0
 _CLOSE_S = 60.0  # so long a disk may take to close a capture,
 _EXTEND_S = 5.0  # of which so much is asked for at a time
+_PAGE_ROWS = 48  # of at most 1 KiB each
+_CALIBRATED = (State.ACCEPTED, State.REJECTED)
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")
 
 
@@ -44,13 +47,16 @@ class Service:
         self._run: Run | None = None
         self._starting = threading.Lock()
         self._changing = threading.Lock()
+        self._choosing = threading.Lock()
         self._closed = False
 
     def handle(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request. Raises Refused and other PolecalErrors."""
         match request.get("class"):
             case "START":
-                return self._start(request.get("name"), force=bool(request.get("force", False)))
+                return self._start(
+                    request.get("name"), request.get("continue"), force=bool(request.get("force", False))
+                )
             case "STATUS":
                 return self.status()
             case "STOP":
@@ -61,6 +67,12 @@ class Service:
                 folder = sessions.folder_of(self._config.state_dir, request.get("session"))
                 path = reporting.write_apart(folder)
                 return {"class": "REPORT", "session": folder.name, "path": str(path)}
+            case "PASSES":
+                return self._passes(request.get("session"), request.get("from", 0))
+            case "DROP" | "KEEP":
+                return self._choose(request, drop=request["class"] == "DROP")
+            case "SESSIONS":
+                return self._sessions(request.get("from", 0))
             case other:
                 raise Refused(
                     f"{other!r} is not a request that this daemon knows", "see README.md", Code.USAGE
@@ -104,7 +116,7 @@ class Service:
             self._config = config
         return changed
 
-    def _start(self, name: str | None, *, force: bool) -> dict[str, Any]:
+    def _start(self, name: str | None, continued: str | None, *, force: bool) -> dict[str, Any]:
         if name is not None and not (isinstance(name, str) and _NAME.fullmatch(name)):
             raise Refused(
                 f"{name!r} is no name for a session", "use 1 to 64 letters, digits, . _ or -", Code.USAGE
@@ -123,19 +135,24 @@ class Service:
                         Code.BUSY,
                     )
                 current.stop("another session was started")
-            run = self._begin(name)
+            run = self._begin(name, continued)
             self._await_streams(run)
         finally:
             self._starting.release()
         return {"class": "STARTED", "session": run.session.id, "devices": run.status()["devices"]}
 
-    def _begin(self, name: str | None) -> Run:
+    def _begin(self, name: str | None, continued: str | None) -> Run:
         with self._changing:
             if self._closed:
                 raise Refused("the daemon is being stopped", "start it again first", Code.BUSY)
-            Space(self._config.state_dir, self._config.storage).require()
-            session = sessions.create(self._config.state_dir, self._config, name)
-            run = Run(self._config, session, self._on_closed)
+            Space(self._config.state_dir, self._config.storage).require(continued)
+            past = None
+            if continued is None:
+                session = sessions.create(self._config.state_dir, self._config, name)
+            else:
+                folder = archive.find(self._config.state_dir, continued)
+                session, past = archive.resume(folder, self._config)
+            run = Run(self._config, session, self._on_closed, past)
             try:
                 run.begin()
             except PolecalError:
@@ -195,6 +212,59 @@ class Service:
 
     def _result(self, session: str | None) -> dict[str, Any]:
         return {"class": "RESULT"} | sessions.calibration_of(self._config.state_dir, session)
+
+    def _passes(self, session: str | None, first: object) -> dict[str, Any]:
+        run = self._run_of(session)
+        if run is not None:
+            name, state, rows = run.session.id, str(run.state), run.passes()
+        else:
+            name = self._named(session)
+            _, pipeline = archive.reopen(archive.find(self._config.state_dir, name))
+            ended = pipeline.routine.state
+            state = str(ended) if ended in _CALIBRATED else shelf.UNFINISHED
+            rows = pipeline.passes()
+        return {"class": "PASSES", "session": name, "state": state} | _page("passes", rows, first)
+
+    def _choose(self, request: dict[str, Any], *, drop: bool) -> dict[str, Any]:
+        by, at = asker(), datetime.now(UTC).isoformat(timespec="seconds")
+        said, session = request.get("pass"), request.get("session")
+        run = self._run_of(session)
+        if run is not None:
+            name, change = run.session.id, run.choose(said, drop=drop, by=by, at=at)
+        else:
+            name = self._named(session)
+            with self._choosing:  # of two at once, the second must know of the first
+                change = archive.choose(
+                    archive.find(self._config.state_dir, name), said, drop=drop, by=by, at=at
+                )
+        return {"class": "CHANGED", "session": name} | change
+
+    def _sessions(self, first: object) -> dict[str, Any]:
+        run = self._run
+        running = (run.session.id, str(run.state)) if run is not None and not run.ended.is_set() else None
+        return {"class": "SESSIONS"} | _page("sessions", shelf.rows(self._config.state_dir, running), first)
+
+    def _run_of(self, session: str | None) -> Run | None:
+        """Give the present run, or the last one's, if that is the session which is meant."""
+        run = self._run
+        return run if run is not None and session in (None, run.session.id) else None
+
+    def _named(self, session: str | None) -> str:
+        """Give the session which is meant, the newest if none is named. Raises Refused."""
+        if session is not None:
+            return session
+        names = sorted(path.name for path in (self._config.state_dir / "sessions").glob("*/"))
+        if not names:
+            raise Refused("there is no session yet", "start one by `polecal-field start`", Code.USAGE)
+        return names[-1]
+
+
+def _page(name: str, rows: list[dict[str, Any]], first: object) -> dict[str, Any]:
+    """Give the part of many rows that fits into a reply, and from where to ask for the rest."""
+    if not isinstance(first, int) or first < 0:
+        raise Refused(f"{first!r} is no number of a row", "send what the last reply's next says", Code.USAGE)
+    last = first + _PAGE_ROWS
+    return {name: rows[first:last], "next": last if last < len(rows) else None}
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,10 +18,16 @@ import yaml
 
 from polecal import PolecalError, __version__
 from polecal.daemon.config import Config, dump
+from polecal.daemon.facts import utc
 from polecal.daemon.passes import StoredPass
+from polecal.daemon.quality import Quality
 
 CAPTURE = "capture.mcap"
 CALIBRATION = "calibration.yaml"
+CAPTURES = "capture*.mcap"
+"""Matches all captures of a session's folder."""
+_LATER = "capture-{}.mcap"
+_NUMBERED = re.compile(r"capture(?:-(\d+))?\.mcap")
 
 
 class SessionError(PolecalError):
@@ -34,6 +41,8 @@ class Session:
     folder: Path
     created: str
     """UTC, ISO 8601."""
+    number: int = 1
+    """Which of its captures is made: one a day that it is gone on with."""
 
     @property
     def id(self) -> str:
@@ -42,8 +51,8 @@ class Session:
 
     @property
     def capture(self) -> Path:
-        """Where its capture is."""
-        return self.folder / CAPTURE
+        """Where this day's capture is."""
+        return self.folder / (CAPTURE if self.number == 1 else _LATER.format(self.number))
 
     def metadata(self, config: Config) -> dict[str, str]:
         """Give what a replay must know; it is in the capture, too, so that one file is enough."""
@@ -58,18 +67,24 @@ class Session:
         """Write a closed pass. Raises SessionError."""
         returns = stored.returns
         blocks = stored.moments.blocks
+        about, quality = stored.facts, stored.quality
+        arrays: dict[str, Any] = {
+            "t_ns": stored.t_ns,
+            "place": stored.place,
+            "gps_ns": stored.gps_ns,
+            "laser": laser,
+            "site": stored.moments.site,
+            "utc": [utc(gps_ns, quality.utc_offset_s) for gps_ns in about.gps_ns],
+            **{name: getattr(about, name) for name in FACTS},
+            **{name: _plain(getattr(quality, name)) for name in QUALITY},
+            **{part.name: getattr(returns, part.name) for part in fields(returns)},
+            "block_slice_kind": [(part, int(kind)) for part, kind in blocks],
+            "block_count": [block.count for block in blocks.values()],
+            "block_first": np.stack([block.first for block in blocks.values()]),
+            "block_second": np.stack([block.second for block in blocks.values()]),
+        }
         with _whole_file(self.folder / "passes" / f"{laser}-{stored.id:03d}.npz") as file:
-            np.savez_compressed(
-                file,
-                t_ns=np.array(stored.t_ns),
-                place=np.array(stored.place),
-                gps_ns=stored.gps_ns,
-                **{part.name: getattr(returns, part.name) for part in fields(returns)},
-                block_slice_kind=np.array([(part, int(kind)) for part, kind in blocks]),
-                block_count=np.array([block.count for block in blocks.values()]),
-                block_first=np.stack([block.first for block in blocks.values()]),
-                block_second=np.stack([block.second for block in blocks.values()]),
-            )
+            np.savez_compressed(file, **arrays)
 
     def write_calibration(self, calibration: dict[str, Any]) -> Path:
         """Write ``calibration.yaml``; give its path. Raises SessionError."""
@@ -77,6 +92,22 @@ class Session:
         with _whole_file(path) as file:
             file.write(yaml.safe_dump(calibration, sort_keys=False, allow_unicode=True).encode())
         return path
+
+
+FACTS = ("heading_deg", "span_deg", "speed_mps", "direction", "nearest_m", "mean_m")
+QUALITY = tuple(part.name for part in fields(Quality))
+"""What a pass's file has of `Facts` and `Quality`, under the same names."""
+
+
+def _plain(value: str | float | None) -> str | float:
+    """Give what numpy can write: None becomes not a number."""
+    return np.nan if value is None else value
+
+
+def captures_of(folder: Path) -> list[Path]:
+    """Give a session's captures, day by day."""
+    numbered = ((_NUMBERED.fullmatch(path.name), path) for path in folder.glob(CAPTURES))
+    return [path for _, path in sorted((int(match[1] or 1), path) for match, path in numbered if match)]
 
 
 def create(state_dir: Path, config: Config, name: str | None) -> Session:
@@ -101,8 +132,11 @@ def create(state_dir: Path, config: Config, name: str | None) -> Session:
 
 
 def discard(session: Session) -> None:
-    """Remove the folder of a session that never began."""
-    shutil.rmtree(session.folder, ignore_errors=True)
+    """Remove the folder of a session that never began; of a later day of one, its capture."""
+    if session.number > 1:
+        session.capture.unlink(missing_ok=True)
+    else:
+        shutil.rmtree(session.folder, ignore_errors=True)
 
 
 def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:

@@ -56,9 +56,9 @@ class Space:
             return None
         return f"only {free / _MB:.0f} MB are free on the disk, of {self._storage.min_free_mb} that must be"
 
-    def require(self) -> None:
-        """Make room for a new session. Raises DiskFull if there is too little even so."""
-        if (why := self.make_room(None)) is not None:
+    def require(self, session: str | None = None) -> None:
+        """Make room for a session that is to run. Raises DiskFull if there is too little even so."""
+        if (why := self.make_room(session)) is not None:
             raise DiskFull(
                 f"{self._sessions}: {why}; no session is left that was not accepted",
                 "make room on the disk, or move accepted sessions away; then start again",
@@ -70,12 +70,12 @@ class Space:
         The oldest go first; never ``running``, nor one that was accepted.
         """
         quota = self._storage.quota_mb
-        sizes = {path: _size(path) for path in sorted(self._sessions.glob("*/"))}
+        sizes = {path: size_of(path) for path in sorted(self._sessions.glob("*/"))}
         for path in sizes.copy():
             over = quota is not None and sum(sizes.values()) > quota * _MB
             if not over and self.lacking() is None:
                 break
-            if path.name == running or _accepted(path):
+            if path.name == running or preserved(path):
                 continue
             shutil.rmtree(path, ignore_errors=True)
             if path.exists():
@@ -99,7 +99,8 @@ class Space:
         return shutil.disk_usage(there).free
 
 
-def _size(folder: Path) -> int:
+def size_of(folder: Path) -> int:
+    """Give how many bytes a session takes."""
     size = 0
     for path in folder.rglob("*"):
         with suppress(OSError):  # a temporary file that has just been renamed
@@ -107,7 +108,7 @@ def _size(folder: Path) -> int:
     return size
 
 
-def _accepted(folder: Path) -> bool:
+def preserved(folder: Path) -> bool:
     """Say whether a session must stay; one whose result cannot be read does."""
     try:
         content = yaml.safe_load((folder / CALIBRATION).read_text(encoding="utf-8"))

@@ -9,6 +9,7 @@ from polecal.drivers.novatel_span.enums import (
     PositionType,
     SolutionStatus,
     TimeStatus,
+    UtcStatus,
 )
 from polecal.drivers.novatel_span.framer import Fault, Frame, Framer, Kind, Skip
 from polecal.drivers.novatel_span.logs import BestPos, InsConfig, InsPva, InsPvax, Time, Version, parse
@@ -43,6 +44,7 @@ __all__ = [
     "SolutionStatus",
     "Time",
     "TimeStatus",
+    "UtcStatus",
     "Version",
     "accuracy",
     "columns",

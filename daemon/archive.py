@@ -1,0 +1,216 @@
+"""A session's folder to what its runs left, and to a pipeline that stands where the last of them ended."""
+
+from __future__ import annotations
+
+import math
+import time
+import zipfile
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from polecal.calib import Kind, Pass, Returns
+from polecal.calib.moments import Moments
+from polecal.daemon import config as configuration
+from polecal.daemon import facts, recorder
+from polecal.daemon.choices import Choice
+from polecal.daemon.config import Config
+from polecal.daemon.control import Code, Refused
+from polecal.daemon.facts import Facts
+from polecal.daemon.passes import Kept
+from polecal.daemon.past import Past
+from polecal.daemon.pipeline import Pipeline
+from polecal.daemon.quality import Quality
+from polecal.daemon.recorder import Event, RecorderError
+from polecal.daemon.replay import BEGIN, CHOICE
+from polecal.daemon.routine import State
+from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, Session, SessionError, captures_of
+
+_OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "port")
+"""Keys of the configuration that may change from day to day."""
+
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, yaml.YAMLError)
+
+
+def find(state_dir: Path, name: object) -> Path:
+    """Give a session's folder. Raises Refused."""
+    folder = state_dir / "sessions"
+    inside = folder.resolve()
+    there = {path.name for path in folder.glob("*/") if path.resolve().parent == inside}  # no link leads away
+    if not isinstance(name, str) or name not in there:
+        raise Refused(f"there is no session {name}", "see `polecal-field sessions`", Code.USAGE)
+    return folder / name
+
+
+def reopen(folder: Path) -> tuple[Session, Pipeline]:
+    """Give a session that is over, and a pipeline that stands where it ended. Raises SessionError."""
+    metadata, config = told(folder)
+    session = Session(folder, metadata["created"], len(captures_of(folder)))
+    pipeline = Pipeline(config, session=session.id, created=session.created)
+    pipeline.reopen(past_of(folder), time.monotonic_ns())
+    return session, pipeline
+
+
+def choose(folder: Path, said: object, *, drop: bool, by: str, at: str) -> dict[str, Any]:
+    """Drop or keep a pass of a session that is over, and write its calibration anew; give what changed.
+
+    Raises Refused, and SessionError where it cannot be read or written: nothing has changed then.
+    """
+    session, pipeline = reopen(folder)
+    choice = replace(pipeline.choice(said, drop=drop, by=by, at=at), ended=True)
+    change = pipeline.choose(time.monotonic_ns(), choice)
+    result = pipeline.calibration()
+    if result is not None:
+        session.write_calibration(result)
+    return change
+
+
+def resume(folder: Path, config: Config) -> tuple[Session, Past]:
+    """Give the next day of a session, and what it starts from.
+
+    Raises SessionError, and Refused where the configuration is not the session's: its passes would be
+    judged by another one than they were made with.
+    """
+    metadata, before = told(folder)
+    differ = list(_differences(before.model_dump(), config.model_dump()))
+    if differ:
+        raise Refused(
+            f"session {folder.name} was made with another configuration: {', '.join(differ)}",
+            f"start polecald with the one in {folder / 'session.yaml'}, or begin a new session",
+            Code.CONFIG,
+        )
+    past = past_of(folder)
+    return Session(folder, metadata["created"], past.site + 1), past
+
+
+def past_of(folder: Path) -> Past:
+    """Read what a session's runs left. Raises SessionError."""
+    passes: dict[str, list[Kept]] = {}
+    for path in sorted((folder / "passes").glob("*.npz"), key=lambda each: (len(each.name), each.name)):
+        passes.setdefault(path.stem.rpartition("-")[0], []).append(read_pass(path))
+    every = {name: sorted({one.where for one in kept}) for name, kept in passes.items()}
+    captures = captures_of(folder)
+    content = calibration(folder)
+    if content is not None and content.get("captures", 1) == len(captures):
+        poles = {
+            laser["name"]: [(each["site"], each["place"]) for each in laser["reflectors"]]
+            for laser in content["lasers"]
+            if "reflectors" in laser
+        }
+        return Past(
+            site=len(captures),
+            passes=passes,
+            poles=every | poles,
+            choices=tuple(Choice.from_dict(each) for each in content.get("choices", [])),
+            ended=State(content["state"]),
+            reference_point=content["lasers"][0].get("reference_point"),
+        )
+    choices, earlier_poles = _recorded(captures[-1]) if captures else ((), {})
+    site = len(captures) - 1
+    poles = {
+        name: sorted({*earlier_poles.get(name, []), *(where for where in each if where[0] == site)})
+        for name, each in every.items()
+    }
+    return Past(site=len(captures), passes=passes, poles=poles, choices=choices)
+
+
+def calibration(folder: Path) -> dict[str, Any] | None:
+    """Read a session's ``calibration.yaml``, None where there is none. Raises SessionError."""
+    path = folder / CALIBRATION
+    if not path.exists():
+        return None
+    content = _yaml(path)
+    if "state" not in content or not content.get("lasers"):
+        raise SessionError(f"{path}: is no calibration", _REPLAY)
+    return content
+
+
+def read_pass(path: Path) -> Kept:
+    """Read a pass's file, also of a version that wrote less into it. Raises SessionError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            blocks = {
+                (int(part), Kind(int(kind))): Moments(int(count), first, second)
+                for (part, kind), count, first, second in zip(
+                    *(file[f"block_{name}"] for name in ("slice_kind", "count", "first", "second")),
+                    strict=True,
+                )
+            }
+            site = int(file["site"]) if "site" in file else 0
+            gps_ns = file["gps_ns"]
+            if "direction" in file:
+                known = {name: file[name].item() for name in FACTS}
+                about = Facts(gps_ns=(int(gps_ns.min()), int(gps_ns.max())), **known)
+                quality = Quality(**{name: _told_value(file[name].item()) for name in QUALITY})
+            else:
+                names = [part.name for part in fields(Returns) if part.name in file]
+                about = facts.of(Returns(**{name: file[name] for name in names}), gps_ns)
+                quality = Quality()
+            first_ns, last_ns = file["t_ns"].tolist()
+            number = int(path.stem.rpartition("-")[2])
+            return Kept(int(file["place"]), (first_ns, last_ns), Pass(number, blocks, site), about, quality)
+    except _DAMAGE as error:
+        raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
+
+
+_REPLAY = "make it anew from the capture: `polecal-field replay`"
+
+
+def _told_value(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def told(folder: Path) -> tuple[dict[str, Any], Config]:
+    """Read what a session was told at its start, and its configuration. Raises SessionError, ConfigError."""
+    path = folder / "session.yaml"
+    metadata = _yaml(path)
+    if not {"created", "config"} <= metadata.keys():
+        raise SessionError(f"{path}: does not say how the session was made", _REPLAY)
+    return metadata, configuration.loads(metadata["config"], str(path))
+
+
+def _yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506
+    except _DAMAGE as error:
+        raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
+    if not isinstance(content, dict):
+        raise SessionError(f"{path}: is not what polecal writes", _REPLAY)
+    return content
+
+
+def _recorded(capture: Path) -> tuple[tuple[Choice, ...], dict[str, list[tuple[int, int]]]]:
+    """Find the choices, and the earlier days' reflectors, of a run that left them in its capture alone."""
+    choices: list[Choice] = []
+    poles: dict[str, list[tuple[int, int]]] = {}
+    try:
+        for item in recorder.read(capture):
+            if not isinstance(item, Event):
+                continue
+            if item.content.get("event") == BEGIN and (past := item.content.get("past")):
+                choices = [Choice.from_dict(each) for each in past["choices"]]
+                poles = {
+                    name: [(site, place) for site, place in each] for name, each in past["poles"].items()
+                }
+            elif item.content.get("event") == CHOICE:
+                choices.append(Choice.from_dict(item.content["choice"]))
+    except RecorderError as error:
+        raise SessionError(str(error), error.hint) from error
+    return tuple(choices), poles
+
+
+def _differences(before: Any, now: Any, path: str = "") -> Iterator[str]:
+    """Give the keys in which two configurations differ that passes depend on."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in before.keys() | now.keys():
+            if key not in _OF_THE_PLACE:
+                yield from _differences(before.get(key), now.get(key), f"{path}.{key}".lstrip("."))
+    elif isinstance(before, list | tuple) and isinstance(now, list | tuple) and len(before) == len(now):
+        for number, (one, other) in enumerate(zip(before, now, strict=True)):
+            yield from _differences(one, other, f"{path}[{number}]")
+    elif before != now:
+        yield path
