@@ -102,7 +102,12 @@ Unknown = Literal["x", "y", "z", "roll", "pitch", "yaw"]
 class _Part(BaseModel):
     # Defaults are checked too: each may clash with a neighbour that was given.
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        validate_default=True,
+        use_attribute_docstrings=True,  # for polecal.yaml(5)
     )
 
 
@@ -110,18 +115,26 @@ class Mount(_Part):
     """A laser's pose on the body as measured by hand: m and degrees, body FRD, order yaw pitch roll."""
 
     x_m: Offset
+    """Forward from the point whose position the receiver reports, m."""
     y_m: Offset
+    """To the right, m."""
     z_m: Offset
+    """Down, m: a laser above that point has a negative one."""
     roll_deg: Angle
+    """Right side down is positive, degrees."""
     pitch_deg: Angle
+    """Looking up is positive, degrees."""
     yaw_deg: Angle
+    """To the right is positive, degrees."""
 
 
 class MountSigma(_Part):
     """How well the mount was measured, one standard deviation."""
 
     xyz_m: Positive = 0.1
+    """Of each of x, y and z, m."""
     rpy_deg: Positive = 5.0
+    """Of each of roll, pitch and yaw, degrees."""
 
 
 class Laser(_Part):
@@ -130,14 +143,24 @@ class Laser(_Part):
     name: Annotated[str, StringConstraints(pattern=r"^[a-z0-9_-]{1,32}$"), AfterValidator(_laser_name)] = (
         "front"
     )
+    """What it is called in status, results and files."""
     port: PortPath
+    """Its serial port; best a name by udev that stays."""
     baud: Annotated[int, _one_of(9600, 19200, 38400, 500000)] = 500000
+    """The line's rate, bit/s; the laser is found at whatever rate it is, and brought to this one."""
     fov_deg: Annotated[int, _one_of(90, 100, 180)] = 100
+    """Its field of view, degrees; 90 is the S14's."""
     resolution_deg: Annotated[float, _one_of(0.25, 0.5, 1.0)] = 0.25
+    """The angle between beams, degrees."""
     reflectivity: Literal["levels", "energy", "s14"] = "levels"
+    """How it tells a reflector: levels (3 bits in each value), energy (with each value), s14 (that type's
+    way)."""
     mount: Mount
+    """Where it sits, as measured by hand."""
     mount_sigma: MountSigma = MountSigma()
+    """How well that was measured."""
     hold: Annotated[tuple[Unknown, ...], Field(strict=False), AfterValidator(_each_once)] = ()
+    """What of x y z roll pitch yaw is not calibrated, but kept as measured."""
 
     # Checks of two fields sit on the later one, so that a fault in a third does not hide them.
     @field_validator("resolution_deg")
@@ -169,11 +192,16 @@ class NavigationSigma(_Part):
     are refused, as passes would differ by more than an accepted calibration may.
     """
 
-    position_m: Positive = 0.2  # north and east, each
+    position_m: Positive = 0.2
+    """North and east, each, m."""
     height_m: Positive = 0.3
+    """Height, m."""
     velocity_mps: Positive = 0.1
+    """North, east and down, each, m/s."""
     roll_pitch_deg: Positive = 0.1
+    """Roll and pitch, each, degrees."""
     azimuth_deg: Positive = 0.5
+    """Azimuth, degrees."""
 
 
 class Navigation(_Part):
@@ -184,12 +212,19 @@ class Navigation(_Part):
     """
 
     port: PortPath
+    """The receiver's serial port; best a name by udev that stays."""
     baud: Annotated[int, _one_of(*_SPAN_BAUDS)] = 230400
+    """The line's rate, bit/s; the receiver is found at whatever rate it is, and brought to this one."""
     rate_hz: Annotated[int, _one_of(*_ONTIME_HZ)] = 100
+    """How many poses a second it shall send; they must fit the line."""
     position_types: Annotated[tuple[str, ...], Field(strict=False)] = _POSITION_TYPES
+    """What its position may rest on, by NovAtel's names; by default whatever has corrections."""
     time_status: Annotated[tuple[str, ...], Field(strict=False)] = _TIME_STATUS
+    """How well it must know the time, by NovAtel's names."""
     max_sigma: NavigationSigma = NavigationSigma()
+    """How uncertain it may be."""
     max_off_course_deg: Annotated[float, Field(gt=0, le=90)] = 10.0
+    """How far azimuth and course over ground may differ on a straight, degrees; 90 never refuses."""
 
     @field_validator("rate_hz")
     @classmethod
@@ -219,16 +254,22 @@ class Pole(_Part):
     """The retro-reflective pole."""
 
     radius_m: Annotated[float, Field(gt=0, le=1)]
+    """Of the pole with its tape, m."""
     height_m: Positive
+    """From the ground to its top, m."""
 
 
 class Routine(_Part):
     """What has to be driven before there is enough."""
 
     slice_deg: Annotated[int, Field(gt=0, le=360)] = 30
+    """How wide a slice of headings is, degrees; divides 360."""
     min_pole_returns: Annotated[int, Field(ge=1)] = 100
+    """So many returns from the pole in each slice."""
     min_passes: Annotated[int, Field(ge=1)] = 1
+    """So many passes in each slice."""
     slices_needed: Annotated[int, Field(ge=1)] = 12
+    """So many slices must have them."""
 
     @field_validator("slice_deg")
     @classmethod
@@ -250,10 +291,15 @@ class MaxSigma(_Part):
     """The largest standard deviations that an accepted calibration may have."""
 
     xy_m: Positive = 0.02
+    """Of x and of y, m."""
     z_m: Positive = 0.02
+    """Of z, m."""
     roll_deg: Positive = 0.1
+    """Of roll, degrees."""
     pitch_deg: Positive = 0.1
+    """Of pitch, degrees."""
     yaw_deg: Positive = 0.1
+    """Of yaw, degrees."""
 
 
 class Accept(_Part):
@@ -264,11 +310,17 @@ class Accept(_Part):
     """
 
     cost_m: Positive = 0.05
+    """The largest cost, the square root of Eq. 7, m."""
     left_out_m: Positive = 0.06
+    """The largest cost of passes that were left out of the fit, m."""
     improvement: Annotated[float, Field(gt=0, lt=1)] = 0.02
+    """The largest part of the cost by which it may still fall through the last passes."""
     doubling: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    """The largest part of the cost by which it may change from every second pass to all."""
     mode: Literal["all", "any"] = "all"
+    """Whether all of the criteria must be met, or any."""
     max_sigma: MaxSigma = MaxSigma()
+    """How uncertain the result may be."""
 
 
 class Storage(_Part):
@@ -278,21 +330,32 @@ class Storage(_Part):
     """
 
     min_free_mb: Annotated[int, Field(ge=1)] = 200
+    """So much stays free on the disk; below it nothing is recorded, MB."""
     quota_mb: Annotated[int, Field(ge=1)] | None = None
+    """So much all sessions may take, MB; null: as much as there is."""
     decoded: bool = True
+    """Whether a closed capture has scans, fixes, frames and clouds in it, too, for robot tools."""
 
 
 class Config(_Part):
     """All that the daemon is told."""
 
     state_dir: Place = Path("/var/lib/polecal")
+    """Where the sessions are."""
     runtime_dir: Place = Path("/run/polecal")
+    """Where the control socket is."""
     lasers: Annotated[tuple[Laser, ...], Field(strict=False), AfterValidator(_at_least_one)]
+    """The lasers, one or more."""
     navigation: Navigation
+    """The receiver."""
     pole: Pole
+    """The pole."""
     routine: Routine = Routine()
+    """What has to be driven."""
     accept: Accept = Accept()
+    """What makes a calibration good enough."""
     storage: Storage = Storage()
+    """How much of the disk sessions may take."""
 
     @property
     def socket(self) -> Path:

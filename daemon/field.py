@@ -39,6 +39,7 @@ _REPORT_S = 600.0  # hours of driving to read through, at a low priority
 _STOP_S = 120.0  # the devices are left polite, and what there is may be calibrated
 _POLL_S = 0.5
 _DECODE_BYTES = 4096
+COMPLETED = ("bash", "zsh", "fish", "sessions", "passes")
 _FORMATS = ("yaml", "json", "urdf", "ros2", "autoware", "snark", "libbot")
 _EXIT_BY_STATE = {State.ACCEPTED: 0, State.REJECTED: Code.REJECTED, State.FAULT: Code.DEVICE}
 _WORKING = (State.CONNECTING, State.ALIGNING, State.COLLECTING)
@@ -46,7 +47,7 @@ _WORKING = (State.CONNECTING, State.ALIGNING, State.COLLECTING)
 
 def main(argv: list[str] | None = None) -> int:
     """Run ``polecal-field``; give its exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = make_parser().parse_args(argv)
     try:
         return int(arguments.run(arguments))
     except PolecalError as error:
@@ -75,21 +76,24 @@ def _common() -> _Parser:
     return common
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of ``polecal-field``, which its manual and completion are made of, too."""
     about = "Calibrate the pose of a vehicle's laser in the field."
     parser = _Parser(prog="polecal-field", description=about, parents=[_common()])
     parser.set_defaults(socket=Path(os.environ.get("POLECAL_SOCKET") or _SOCKET), json=False)
-    parser.add_argument("--version", action="version", version=__version__)
+    parser.add_argument("--version", action="version", version=__version__, help="print its version")
     verbs = parser.add_subparsers(title="verbs", required=True, metavar="VERB")
 
     def verb(run: Callable[[argparse.Namespace], int], about: str) -> _Parser:
         name = run.__name__.strip("_")
-        made = verbs.add_parser(name, parents=[_common()], help=about, description=about.capitalize() + ".")
+        made = verbs.add_parser(
+            name, parents=[_common()], help=about, description=about[:1].upper() + about[1:] + "."
+        )
         made.set_defaults(run=run)
         return made
 
     start = verb(_start, "begin a session; returns once every device streams")
-    start.add_argument("--name", help="goes into the session's name")
+    start.add_argument("--name", metavar="NAME", help="goes into the session's name")
     start.add_argument("--continue", dest="session", metavar="SESSION", help="go on with it, on another day")
     start.add_argument("--force", action="store_true", help="also where a session is running, which ends")
     status = verb(_status, "show how it stands and what to drive next")
@@ -108,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--out", type=Path, metavar="FILE", help="elsewhere than into the session's folder")
     report.add_argument("--png", type=Path, metavar="DIR", help="the drawings, too, as PNG")
     passes = verb(_passes, "list a session's passes, by default the present or last one's")
-    passes.add_argument("session", nargs="?", metavar="SESSION")
+    passes.add_argument("session", nargs="?", metavar="SESSION", help="its name")
     for done in (_drop, _keep):
         about = "leave a pass out" if done is _drop else "take a pass back"
         chosen = verb(done, f"{about}, calibrate again, and show what changed")
@@ -116,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
         chosen.add_argument("--session", metavar="SESSION", help="by default the present or last one")
     verb(_sessions, "list the sessions")
     replay = verb(_replay, "run a capture through the whole pipeline again, without a daemon")
-    replay.add_argument("capture", type=Path, metavar="CAPTURE", help="or its session's folder")
+    replay.add_argument("capture", type=Path, metavar="CAPTURE", help="its file, or its session's folder")
     replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
     replay.add_argument("--out", type=Path, metavar="DIR", help="where calibration and passes go")
     imported = verb(_import, "make a capture of raw serial dumps, for replay")
@@ -132,13 +136,15 @@ def _parser() -> argparse.ArgumentParser:
     imported.add_argument("--config", type=Path, required=True, metavar="FILE", help="what it replays with")
     imported.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="the capture to make")
     export = verb(_export, "write a capture's bytes as raw serial dumps, a file a device")
-    export.add_argument("capture", type=Path, metavar="CAPTURE")
+    export.add_argument("capture", type=Path, metavar="CAPTURE", help="its file")
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the dumps go")
     doctor = verb(_doctor, "look for what is wrong with ports, devices, disk and clock")
     doctor.add_argument("--config", type=Path, metavar="FILE", help=f"else $POLECAL_CONFIG, else {_CONFIG}")
     decode = verb(_decode, "print a raw byte file as JSON lines, one a frame")
     decode.add_argument("file", metavar="FILE", help="- for standard input")
-    decode.add_argument("--as", dest="kind", choices=["sick_lms", "novatel_span"], required=True)
+    decode.add_argument(
+        "--as", dest="kind", choices=["sick_lms", "novatel_span"], required=True, help="whose bytes"
+    )
     emulate = verb(_emulate, "run an emulated laser and receiver on pseudo-terminals")
     emulate.add_argument("--lms-link", metavar="PATH", help="name the laser's terminal so")
     emulate.add_argument("--span-link", metavar="PATH", help="name the receiver's terminal so")
@@ -147,6 +153,8 @@ def _parser() -> argparse.ArgumentParser:
     demo = verb(_demo, "calibrate emulated devices with a real daemon; found against true")
     demo.add_argument("--out", type=Path, metavar="DIR", help="where all of it goes")
     demo.add_argument("--seed", type=int, default=1, metavar="N", help="which drive in which world")
+    completion = verb(_completion, "print what makes a shell complete this command's arguments")
+    completion.add_argument("shell", choices=COMPLETED, help="or of what to print the names")
     return parser
 
 
@@ -503,6 +511,16 @@ def _demo(arguments: argparse.Namespace) -> int:
     from polecal.daemon.demo import demo  # noqa: PLC0415
 
     return demo(arguments.out or Path(tempfile.mkdtemp(prefix="polecal-demo-")), arguments.seed)
+
+
+def _completion(arguments: argparse.Namespace) -> int:
+    from polecal.daemon.completion import names, script  # noqa: PLC0415
+
+    if arguments.shell in ("sessions", "passes"):
+        print("\n".join(names(arguments.socket, arguments.shell)))
+    else:
+        print(script(make_parser(), arguments.shell))
+    return 0
 
 
 def _show(status: dict[str, Any], arguments: argparse.Namespace) -> None:

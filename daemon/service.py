@@ -34,6 +34,7 @@ _CLOSE_S = 60.0  # so long a disk may take to close a capture,
 _EXTEND_S = 5.0  # of which so much is asked for at a time
 _PAGE_ROWS = 48  # of at most 1 KiB each
 _CALIBRATED = (State.ACCEPTED, State.REJECTED)
+_ABOUT = "The daemon that calibrates the pose of a vehicle's lasers, in the foreground."
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")
 
 
@@ -267,13 +268,18 @@ def _page(name: str, rows: list[dict[str, Any]], first: object) -> dict[str, Any
     return {name: rows[first:last], "next": last if last < len(rows) else None}
 
 
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of ``polecald``, which its manual is made of, too."""
+    parser = argparse.ArgumentParser(prog="polecald", description=_ABOUT)
+    parser.add_argument("--config", required=True, metavar="FILE", help="the configuration, YAML")
+    parser.add_argument("--check-config", action="store_true", help="only say whether it can be used")
+    parser.add_argument("--version", action="version", version=__version__, help="print its version")
+    return parser
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run ``polecald``; give its exit code."""
-    parser = argparse.ArgumentParser(prog="polecald", description=__doc__)
-    parser.add_argument("--config", required=True, help="the configuration, YAML")
-    parser.add_argument("--check-config", action="store_true", help="only say whether it can be used")
-    parser.add_argument("--version", action="version", version=__version__)
-    arguments = parser.parse_args(argv)
+    arguments = make_parser().parse_args(argv)
     try:
         config = load(arguments.config)
         if arguments.check_config:
