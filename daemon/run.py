@@ -272,7 +272,6 @@ class Run:
     def _work(self) -> None:
         """Hear what was recorded until every device is left, and nothing waits."""
         while any(thread.is_alive() for thread in self._threads):
-            self._beat_s = time.monotonic()
             self._do(self._writer.get(_LOOK_S))
         try:
             self._writer.close()
@@ -289,6 +288,7 @@ class Run:
             self._on_closed(self.session.capture)
 
     def _do(self, item: object | None) -> None:
+        self._beat_s = time.monotonic()
         try:
             match item:
                 case Event(content={"event": "choice"}):

@@ -163,7 +163,9 @@ def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
 
 def folder_of(state_dir: Path, session: str | None) -> Path:
     """Give a session's folder, the last one's if none is named. Raises SessionError."""
-    folders = sorted(path.parent for path in (state_dir / "sessions").glob("*/session.yaml"))
+    inside = (state_dir / "sessions").resolve()
+    files = (state_dir / "sessions").glob("*/session.yaml")
+    folders = sorted(path.parent for path in files if path.parent.resolve().parent == inside)
     folders = [folder for folder in folders if session is None or folder.name == session]
     if not folders:
         what = "there is no session yet" if session is None else f"there is no session {session}"

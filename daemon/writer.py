@@ -7,6 +7,7 @@ nothing but this; and however long the hearing takes, recording goes on.
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import threading
 import time
@@ -120,6 +121,7 @@ class Writer:
             except Exception as error:  # a bug: what comes in is still recorded
                 self._log.exception("bug")
                 self._hand_on(PolecalError(f"a bug in polecal: {error!r}", _BUG))
+        self.beat_s = math.inf  # done, which is not stuck
 
     def _take(self, item: object, bounded: bool) -> None:
         if item is self._closed:

@@ -225,6 +225,7 @@ def state(tmp_path):
     outside = tmp_path / "outside"
     outside.mkdir()
     (outside / CALIBRATION).write_text("state: accepted\nsecret: yes\n")
+    (outside / "session.yaml").write_text("created: never\n")
     folder = tmp_path / "state" / "sessions"
     (folder / "20260101T000000Z-yard" / "passes").mkdir(parents=True)
     (folder / "20260101T000000Z-yard" / CALIBRATION).write_text("state: accepted\n")
@@ -252,11 +253,18 @@ LEADING_OUT = [
 
 
 @pytest.mark.parametrize("name", LEADING_OUT)
-def test_a_result_is_only_of_a_session_in_the_state_folder(settings, state, tmp_path, name):
+def test_a_session_is_only_one_in_the_state_folder_whatever_is_asked_of_it(settings, state, tmp_path, name):
     service = Service(settings(state_dir=str(state)))
     if name == "/absolute":
         name = str(tmp_path / "outside")
     with pytest.raises(PolecalError, match=r"has no calibration|no session was accepted"):
         service.handle({"class": "RESULT", "session": name})
+    before = sorted(path.name for path in (tmp_path / "outside").iterdir())
+    for request in ("REPORT", "PASSES", "DROP", "KEEP"):
+        with pytest.raises(PolecalError, match=r"there is no session|session.yaml: cannot be read"):
+            service.handle({"class": request, "session": name, "pass": 1})
+    with pytest.raises(PolecalError, match=r"there is no session|session.yaml: cannot be read"):
+        service.handle({"class": "START", "continue": name})
+    assert sorted(path.name for path in (tmp_path / "outside").iterdir()) == before
     last = service.handle({"class": "RESULT"})
     assert last == {"class": "RESULT", "state": "accepted"}

@@ -9,6 +9,7 @@ import time
 import pytest
 from structlog.testing import capture_logs
 
+from polecal.daemon import service as service_module
 from polecal.daemon.notify import Manager, summary
 from polecal.daemon.service import Service
 
@@ -138,7 +139,7 @@ def ages_s(service):
 
 
 def test_devices_that_are_unplugged_or_silent_are_not_stuck(service, bench, until):
-    assert {"front", "span", "engine"} <= service.beats().keys()
+    assert {"front", "span", "engine", "writer"} == service.beats().keys()
     bench.served.unplug(bench.lms)
     bench.receiver.transmit = lambda *_: b""  # and this one says nothing more
     oldest_s = 0.0
@@ -166,7 +167,7 @@ def test_a_reader_that_is_stuck_stops_the_pings_until_it_goes_on(service, manage
         until(lambda: ages_s(service)[name] > 1.0)
         manager.alive(service.beats())
         assert listener.heard() == []
-        assert {other for other, age_s in ages_s(service).items() if age_s < 0.75} >= {"engine"}
+        assert {other for other, age_s in ages_s(service).items() if age_s < 0.75} >= {"engine", "writer"}
     finally:
         free.set()
     until(lambda: ages_s(service)[name] < 0.75)
@@ -210,3 +211,26 @@ def test_the_summary_says_state_progress_trouble_and_what_to_do():
 
 def test_the_summary_of_an_idle_daemon_says_how_to_start(settings):
     assert summary(Service(settings()).status()) == "idle: polecal-field start"
+
+
+def test_while_a_capture_is_being_closed_more_time_is_asked_for_but_not_for_ever(
+    manager, listener, until, monkeypatch
+):
+    class Slow:
+        """A service whose disk takes its time."""
+
+        def close(self):
+            free.wait(30.0)
+
+    free = threading.Event()
+    monkeypatch.setattr(service_module, "_TELL_S", 0.01)
+    monkeypatch.setattr(service_module, "_CLOSE_S", 0.5)
+    closing = threading.Thread(target=service_module._close, args=(Slow(), manager))
+    closing.start()
+    asked = until(listener.heard)
+    assert set(asked) == {"EXTEND_TIMEOUT_USEC=5000000"}
+    until(lambda: not listener.heard() and time.sleep(0.2) is None and not listener.heard())
+    assert closing.is_alive()
+    free.set()
+    closing.join(5.0)
+    assert not closing.is_alive()
