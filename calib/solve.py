@@ -99,6 +99,12 @@ class Scatter:
         means: Array = self._mean @ rows.T
         return means
 
+    def yaw_rad(self) -> Array:
+        """Give each pass's platform yaw (P,), rad, in the mean over its returns."""
+        forward = self._mean.reshape(-1, 3, WIDTH)[:, :, 6]  # the first column of C
+        yaw: Array = np.arctan2(forward[:, 1], forward[:, 0])
+        return yaw
+
     def within(self, rows: Array) -> Array:
         """Give each pass's variance within, (P,), m², the mean over the given rows (k, 108)."""
         summed = np.einsum("ki,pij,kj->p", rows, self._within, rows)

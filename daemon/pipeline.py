@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from polecal.calib import CalibrationError, Mount, Pass, Result, estimate, residuals
+from polecal.calib import CalibrationError, Mount, Pass, Result, Verdict, estimate, residuals
+from polecal.calib.agreement import View, disagreements
 from polecal.calib.coverage import headings
 from polecal.calib.geometry import wrap
 from polecal.daemon import results, rows
@@ -56,6 +57,9 @@ class _LaserRun:
         self.setup = results.setup_of(config, laser)
         self._on_scan = partial(on_scan, laser.name) if on_scan is not None else None
         self.result: Result | None = None
+        self.alone: Result | None = None
+        """The same, before it is compared with what other lasers say."""
+        self.view: View | None = None
         self.costs_m: deque[float] = deque(maxlen=_COSTS)
         self.passes: list[Kept] = []
         """All that were closed, in their order, of the pole or of another reflector."""
@@ -92,12 +96,16 @@ class _LaserRun:
     def estimate(self, *, everywhere: bool) -> None:
         """Calibrate on the passes of the pole, less what was dropped."""
         poles = self.poles()
-        passes = [one.moments for one in self.passes if one.where in poles and one.id not in self.dropped]
-        self.result, self.channel.mount = None, self.setup.measured
+        kept = [one for one in self.passes if one.where in poles and one.id not in self.dropped]
+        passes = [one.moments for one in kept]
+        self.alone = self.result = self.view = None
+        self.channel.mount = self.setup.measured
         if not passes:
             return  # what was thin from one side has turned out to be a plate, or all were dropped
         with suppress(CalibrationError):
-            self.result = estimate(passes, self.setup, everywhere=everywhere)
+            self.alone = self.result = estimate(passes, self.setup, everywhere=everywhere)
+            spans_ns = [one.facts.gps_ns for one in kept]
+            self.view = View.of(self.name, passes, spans_ns, self.setup, self.result)
             # One pass over level ground may put the laser anywhere; what is placed by that is lost.
             if self._could_be(self.result.mount):
                 self.channel.mount = self.result.mount
@@ -181,6 +189,7 @@ class Pipeline:
             self.remember(past)
             for laser in self._lasers.values():
                 laser.estimate(everywhere=True)
+            self._compare()
         self.routine.to(State.CONNECTING, t_ns, "asked to start")
 
     def remember(self, past: Past) -> None:
@@ -211,6 +220,7 @@ class Pipeline:
         self._site = past.site - 1  # no new day
         for laser in self._lasers.values():
             laser.estimate(everywhere=True)
+        self._compare()
         if past.ended is not None:
             self._reference_point = past.reference_point
             self.routine.reopen(past.ended, t_ns)
@@ -255,11 +265,14 @@ class Pipeline:
         self._judge(t_ns)
 
     def _judge(self, t_ns: int) -> None:
+        apart = self._compare()
         reasons = [
             f"{laser.name}: {reason}"
             for laser in self._lasers.values()
             for reason in self._entry(laser)["verdict"]["reasons"]
+            if reason not in apart
         ]
+        reasons += apart
         state = State.REJECTED if reasons else State.ACCEPTED
         self.routine.to(state, t_ns, "; ".join(reasons) or "all criteria are met")
 
@@ -419,7 +432,20 @@ class Pipeline:
             self._on_pass(laser.name, stored)
         laser.take(stored)
 
+    def _compare(self) -> tuple[str, ...]:
+        """Accept no laser where two of them cannot both be right; say which."""
+        apart = disagreements([laser.view for laser in self._lasers.values() if laser.view is not None])
+        enough = all(laser.alone and laser.alone.verdict.accepted for laser in self._lasers.values())
+        for laser in self._lasers.values():
+            laser.result = laser.alone
+            if apart and laser.alone is not None:
+                verdict = laser.alone.verdict
+                refused = Verdict(False, (*verdict.reasons, *apart), enough or verdict.hopeless)
+                laser.result = replace(laser.alone, verdict=refused)
+        return apart
+
     def _conclude(self, t_ns: int) -> None:
+        self._compare()
         if self.routine.state is not State.COLLECTING:
             return
         verdicts = [laser.result.verdict for laser in self._lasers.values() if laser.result is not None]

@@ -146,6 +146,28 @@ def test_two_lasers_in_one_world_are_both_calibrated(begun, settings, drive, t0_
         assert max(abs((off[key] + 180) % 360 - 180) for key in ANGLES) <= 0.15
         assert max(abs(off[key]) for key in ("x_m", "y_m")) <= 0.025
         assert laser["passes"] > 5
+        assert not any("disagree" in reason for reason in laser["verdict"]["reasons"])
+
+
+def test_two_lasers_of_which_one_is_held_where_it_is_not_are_both_rejected_and_why(
+    begun, settings, drive, t0_ns
+):
+    """The same laser twice, the second measured 15 cm off, and said to be good to a centimetre."""
+    heard = [chunk for device, t_ns, data in drive.until(70.0) for chunk in _twice(device, t_ns, data)]
+    front = settings().lasers[0].model_dump()
+    measured = front["mount"] | {"y_m": front["mount"]["y_m"] + 0.15}
+    copy = front | {"name": "copy", "port": "/dev/lms-copy", "mount": measured, "hold": ["y"]}
+    copy["mount_sigma"] = {"xyz_m": 0.01, "rpy_deg": 5.0}
+    played = begun(settings(lasers=[front, copy])).feed(heard).finish()
+    assert played.state is State.REJECTED
+    for laser in played.pipeline.calibration()["lasers"]:
+        assert not laser["verdict"]["accepted"]
+        assert any("front and copy disagree" in reason for reason in laser["verdict"]["reasons"])
+    assert played.transitions[-1][3].count("front and copy disagree") == 1
+
+
+def _twice(device, t_ns, data):
+    return [(name, t_ns, data) for name in (("front", "copy") if device == "front" else (device,))]
 
 
 # --- runs that come to nothing
