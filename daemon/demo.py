@@ -21,7 +21,7 @@ from rich.table import Table
 from polecal import PolecalError
 from polecal.calib import KEYS, PARAMETERS, Mount
 from polecal.daemon.control import Client
-from polecal.daemon.routine import ENDED, State
+from polecal.daemon.routine import ENDED
 from polecal.daemon.screen import Screen
 from polecal.daemon.sessions import CALIBRATION, CAPTURE
 
@@ -37,12 +37,11 @@ class DemoError(PolecalError):
     """A part of the demonstration did not come up."""
 
 
-def demo(out: Path, seed: int) -> int:
-    """Run the demonstration into the folder ``out``; give the exit code, 0 if it ended accepted.
+def demo(out: Path, seed: int, console: Console) -> dict[str, Any]:
+    """Run the demonstration into the folder ``out``, told on a console; give its calibration's content.
 
     Raises DemoError, and what the daemon refuses.
     """
-    console = Console()
     out = out.resolve()
     out.mkdir(parents=True, exist_ok=True)
     began_s = time.monotonic()
@@ -70,7 +69,7 @@ def demo(out: Path, seed: int) -> int:
         f"[bold]{content['state']}[/bold] after {time.monotonic() - began_s:.0f} s", highlight=False
     )
     console.print(f"the same again from its capture: polecal-field replay {folder / CAPTURE}", soft_wrap=True)
-    return 0 if content["state"] == State.ACCEPTED else 5
+    return dict(content)
 
 
 @contextmanager

@@ -129,7 +129,7 @@ def _ask(socket: Path) -> tuple[Check, dict[str, Any] | None]:
 
 def _disk(config: Config) -> Check:
     name, folder = "disk", config.state_dir
-    while not folder.exists() and folder != folder.parent:
+    while not os.path.exists(folder) and folder != folder.parent:  # or this user may not see it
         folder = folder.parent
     room = shutil.disk_usage(folder).free - config.storage.min_free_mb * 1_000_000
     left_s = room / (_RECORDED_BYTES_S * len(config.lasers))

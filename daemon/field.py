@@ -38,6 +38,7 @@ _START_S = 300.0  # a device search tries every rate, twice, and may write an EE
 _REPORT_S = 600.0  # hours of driving to read through, at a low priority
 _STOP_S = 120.0  # the devices are left polite, and what there is may be calibrated
 _POLL_S = 0.5
+_SEE_STATUS = "see `polecal-field status`"
 _DECODE_BYTES = 4096
 COMPLETED = ("bash", "zsh", "fish", "sessions", "passes")
 _FORMATS = ("yaml", "json", "urdf", "ros2", "autoware", "snark", "libbot")
@@ -47,25 +48,42 @@ _WORKING = (State.CONNECTING, State.ALIGNING, State.COLLECTING)
 
 def main(argv: list[str] | None = None) -> int:
     """Run ``polecal-field``; give its exit code."""
-    arguments = make_parser().parse_args(argv)
+    argv = sys.argv[1:] if argv is None else argv
     try:
-        return int(arguments.run(arguments))
+        arguments = make_parser().parse_args(argv)
+        code = int(arguments.run(arguments))
+        sys.stdout.flush()
+        return code
     except PolecalError as error:
-        if arguments.json:
+        if "--json" in argv:
             _print_json(control.as_message(error))
         _complain(str(error), error.hint)
         return control.code_of(error)
-    except BrokenPipeError:  # whoever read has enough; what Python flushes at its exit must not fail too
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # whoever read has enough
+        _forget_output()
         return 0
+    except OSError as error:  # whatever it is, the operator needs no traceback of it
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _forget_output()
+        where = f"{error.filename}: " if error.filename else ""
+        _complain(
+            f"{where}{error.strerror or error}", "see whether there is room, and who may read and write"
+        )
+        return Code.DEGRADED
     except KeyboardInterrupt:
         return 130
 
 
+def _forget_output() -> None:
+    """Let what Python flushes at its exit go nowhere, as it would fail again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        _complain(message, f"see `{self.prog} --help`")
-        sys.exit(Code.USAGE)
+        raise Refused(message, f"see `{self.prog} --help`", Code.USAGE)
 
 
 def _common() -> _Parser:
@@ -257,14 +275,13 @@ def _wait(arguments: argparse.Namespace) -> int:
                 _show(status, arguments)
                 return 0 if wanted else _EXIT_BY_STATE[state]
             if state in _EXIT_BY_STATE:
-                _complain(f"it ended {state}, and will not be {wanted}", "see `polecal-field status`")
-                return _EXIT_BY_STATE[state] or Code.DEGRADED
+                code = _EXIT_BY_STATE[state] or Code.DEGRADED
+                raise Refused(f"it ended {state}, and will not be {wanted}", _SEE_STATUS, code)
             if state == State.IDLE and wanted is None:
                 raise Refused("no session is running", "start one by `polecal-field start`", Code.USAGE)
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
-                _complain(f"still {state} after {arguments.timeout:g} s", "see `polecal-field status`")
-                return Code.DEGRADED
+                raise Refused(f"still {state} after {arguments.timeout:g} s", _SEE_STATUS)
             time.sleep(min(_POLL_S, left_s))
 
 
@@ -276,7 +293,7 @@ def _stop(arguments: argparse.Namespace) -> int:
     else:
         print(f"session {answer.get('session')} has ended: {answer.get('state')}")
     for note in answer.get("notes", []):
-        _complain(note, "see `polecal-field status`")
+        _complain(note, _SEE_STATUS)
     state, done = answer.get("state"), Code.DEGRADED if answer.get("notes") else 0
     return (_EXIT_BY_STATE[state] if arguments.calibrate and state in _EXIT_BY_STATE else 0) or done
 
@@ -424,17 +441,24 @@ def _import(arguments: argparse.Namespace) -> int:
             arguments.span_arrivals or arguments.span_rate or line_rate(config.navigation.baud),
         ),
     }
-    for note in import_dumps(arguments.out, config, dumps):
+    notes = import_dumps(arguments.out, config, dumps)
+    for note in notes:
         _complain(f"warning: {note}", "give its arrival times")
-    print(f"capture: {arguments.out}")
+    if arguments.json:
+        _print_json({"class": "IMPORT", "capture": str(arguments.out), "notes": list(notes)})
+    else:
+        print(f"capture: {arguments.out}")
     return 0
 
 
 def _export(arguments: argparse.Namespace) -> int:
     from polecal.daemon.transfer import export_dumps  # noqa: PLC0415
 
-    for path in export_dumps(arguments.capture, arguments.out):
-        print(path)
+    paths = [str(path) for path in export_dumps(arguments.capture, arguments.out)]
+    if arguments.json:
+        _print_json({"class": "EXPORT", "paths": paths})
+    else:
+        print("\n".join(paths))
     return 0
 
 
@@ -510,7 +534,11 @@ def _emulate(arguments: argparse.Namespace) -> int:
 def _demo(arguments: argparse.Namespace) -> int:
     from polecal.daemon.demo import demo  # noqa: PLC0415
 
-    return demo(arguments.out or Path(tempfile.mkdtemp(prefix="polecal-demo-")), arguments.seed)
+    console = Console(stderr=arguments.json)
+    content = demo(arguments.out or Path(tempfile.mkdtemp(prefix="polecal-demo-")), arguments.seed, console)
+    if arguments.json:
+        _print_json({"class": "RESULT"} | content)
+    return 0 if content["state"] == State.ACCEPTED else Code.REJECTED
 
 
 def _completion(arguments: argparse.Namespace) -> int:
@@ -536,7 +564,7 @@ def _print_json(content: dict[str, Any]) -> None:
 
 
 def _complain(what: str, hint: str) -> None:
-    print(f"polecal-field: {what}", *([f"hint: {hint}"] if hint else []), sep="\n", file=sys.stderr)
+    print(f"polecal-field: {what}", f"hint: {hint or 'see `man polecal-field`'}", sep="\n", file=sys.stderr)
 
 
 if __name__ == "__main__":
