@@ -142,15 +142,19 @@ def make_parser() -> argparse.ArgumentParser:
     replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
     replay.add_argument("--out", type=Path, metavar="DIR", help="where calibration and passes go")
     imported = verb(_import, "make a capture of raw serial dumps, for replay")
-    imported.add_argument("--lms", type=Path, required=True, metavar="FILE", help="what the laser said")
+    arrivals, rate = "byte_offset,host_time_s of its dump", "bytes/s without arrivals, else its line's rate"
+    lms: dict[str, Any] = {"action": "append", "default": []}
+    imported.add_argument(
+        "--lms",
+        **lms | {"required": True},
+        metavar="[NAME=]FILE",
+        help="what a laser said; once for each of the configuration, NAME= only if there are several",
+    )
+    imported.add_argument("--lms-arrivals", **lms, metavar="[NAME=]CSV", help=arrivals)
+    imported.add_argument("--lms-rate", **lms, metavar="[NAME=]B", help=rate)
     imported.add_argument("--span", type=Path, required=True, metavar="FILE", help="what the receiver said")
-    for name in ("lms", "span"):
-        imported.add_argument(
-            f"--{name}-arrivals", type=Path, metavar="CSV", help="byte_offset,host_time_s of its dump"
-        )
-        imported.add_argument(
-            f"--{name}-rate", type=float, metavar="B", help="bytes/s without arrivals, else its line's rate"
-        )
+    imported.add_argument("--span-arrivals", type=Path, metavar="CSV", help=arrivals)
+    imported.add_argument("--span-rate", type=float, metavar="B", help=rate)
     imported.add_argument("--config", type=Path, required=True, metavar="FILE", help="what it replays with")
     imported.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="the capture to make")
     export = verb(_export, "write a capture's bytes as raw serial dumps, a file a device")
@@ -427,23 +431,15 @@ def _progress() -> Iterator[Callable[[float], None] | None]:
 
 def _import(arguments: argparse.Namespace) -> int:
     from polecal.daemon import config as configuration  # noqa: PLC0415
-    from polecal.daemon.transfer import import_dumps, line_rate  # noqa: PLC0415
+    from polecal.daemon.transfer import dumps_of, import_dumps, line_rate  # noqa: PLC0415
 
     config = configuration.load(arguments.config)
-    laser = config.lasers[0]
-    dumps = {
-        laser.name: (
-            arguments.lms,
-            arguments.lms_arrivals or arguments.lms_rate or line_rate(laser.baud),
-        ),
-        configuration.SPAN: (
-            arguments.span,
-            arguments.span_arrivals or arguments.span_rate or line_rate(config.navigation.baud),
-        ),
-    }
-    notes = import_dumps(arguments.out, config, dumps)
+    span = arguments.span_arrivals or arguments.span_rate or line_rate(config.navigation.baud)
+    dumps = dumps_of(config, arguments.lms, arguments.lms_arrivals, arguments.lms_rate)
+    notes = import_dumps(arguments.out, config, dumps | {configuration.SPAN: (arguments.span, span)})
     for note in notes:
-        _complain(f"warning: {note}", "give its arrival times")
+        what, _, hint = note.rpartition("; ")
+        _complain(f"warning: {what}", hint)
     if arguments.json:
         _print_json({"class": "IMPORT", "capture": str(arguments.out), "notes": list(notes)})
     else:
