@@ -173,7 +173,7 @@ def _notes(given: _Dump) -> list[str]:
     if not framer.feed(begin, 0):
         kind = "NovAtel receiver" if given.name == SPAN else "SICK laser"
         notes.append(
-            f"{given.name}: nothing of a {kind} in the first {len(begin)} bytes of {given.path}: "
+            f"{given.name}: nothing of a {kind} in the first {len(begin)} bytes of {given.path}; "
             "see that it is the right file, and that of a line with the right baud rate"
         )
     return notes
