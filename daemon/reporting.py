@@ -304,7 +304,7 @@ def _passes(
         if of != laser or not number.isdigit():
             continue
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 names = [part.name for part in fields(Returns) if part.name in file]
                 returns = Returns(**{name: file[name] for name in names})
                 first_ns, last_ns = file["t_ns"].tolist()

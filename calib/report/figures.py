@@ -51,7 +51,7 @@ _STYLE: Any = {
 }
 _styled = mpl.rc_context(_STYLE)
 HEADINGS = LinearSegmentedColormap.from_list(
-    "headings", ["#2f6fd0", "#57b8b0", "#d8a520", "#a83a70", "#2f6fd0"], N=256
+    "headings", ["#2f6fd0", "#62c4bb", "#d8a520", "#8f2a5c", "#2f6fd0"], N=256
 )
 """Of a heading from north by east: opposite ones differ in lightness or along blue and yellow, which all
 colour-blind readers see; none is lost on a white page or a dark one."""

@@ -30,6 +30,9 @@ def rules(entry: Mapping[str, Any], setup: Setup) -> list[Rule]:
     done = sum(part["done"] for part in entry["coverage"])
     cost_m, gain = entry["cost_m"], entry["improvement"]
     either = ", or the other of the two" if criteria.mode == "any" else ""
+    cheap = cost_m is not None and cost_m <= criteria.cost_m
+    settled = gain is not None and gain <= criteria.improvement
+    one_will_do = criteria.mode == "any" and (cheap or settled)
     told = [
         Rule(
             f"slices with at least {need.min_pole_returns} pole returns"
@@ -43,13 +46,13 @@ def rules(entry: Mapping[str, Any], setup: Setup) -> list[Rule]:
             f"cost √c{either}",
             f"≤ {1000 * criteria.cost_m:.1f} mm",
             "unknown" if cost_m is None else f"{1000 * cost_m:.1f} mm",
-            cost_m is not None and cost_m <= criteria.cost_m,
+            cheap or one_will_do,
         ),
         Rule(
             f"improvement of √c by the last passes{either}",
             f"≤ {criteria.improvement:.1%}",
             "unknown" if gain is None else f"{gain:.2%}",
-            gain is not None and gain <= criteria.improvement,
+            settled or one_will_do,
         ),
     ]
     if entry["estimate"] is None:
