@@ -249,7 +249,7 @@ def _laser(
         else "the drive tells it no better than the hand measurement does"
         for name in entry["held"]
     }
-    told = {"improvement": None, "extras": {}, "measured": setup.measured.as_dict()} | dict(entry)
+    told = {"extras": {}, "measured": setup.measured.as_dict()} | dict(entry)
     return LaserReport(laser.name, setup, told, evidence, held_why, _to_know_more(setup, entry)), seen
 
 

@@ -172,11 +172,11 @@ def test_an_angle_in_millimetres():
     [
         (Criteria(), 14, set()),
         (Criteria(cost_m=0.01), 14, {"cost √c"}),
-        (Criteria(improvement=1e-9), 14, {"improvement of √c by the last passes"}),
+        (Criteria(improvement=1e-9), 14, {"√c improved by the last passes by"}),
         (Criteria(cost_m=0.001, mode="any"), 14, set()),
         (Criteria(max_sigma=(1e-5, 1.0, 1.0, 1.0, 1.0, 1.0)), 14, {"σ of x"}),
-        (Criteria(max_shift_sigmas=0.1), 14, {"change of yaw", "change of roll"}),
-        (Criteria(), 3, {"passes", "improvement of √c by the last passes"}),
+        (Criteria(max_shift_sigmas=0.1), 14, {"roll, pitch, yaw: off the hand measurement, in its σ"}),
+        (Criteria(), 3, {"passes", "√c improved by the last passes by"}),
     ],
 )
 def test_the_rules_are_those_of_the_verdict(returns, setup, criteria, passes, unmet):
