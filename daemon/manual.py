@@ -249,12 +249,14 @@ def main(argv: list[str] | None = None) -> int:
     """Write the pages into a folder, ``man1`` and so on below it; give the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("build/man"), metavar="DIR", help="a man path")
-    out = parser.parse_args(argv).out
+    parser.add_argument("--quiet", action="store_true", help="do not name the files")
+    arguments = parser.parse_args(argv)
     for name, page in pages().items():
-        path = out / f"man{name[-1]}" / name
+        path = arguments.out / f"man{name[-1]}" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(page, encoding="utf-8")
-        sys.stdout.write(f"{path}\n")
+        if not arguments.quiet:
+            sys.stdout.write(f"{path}\n")
     return 0
 
 

@@ -151,6 +151,9 @@ CHANGED = (
     "/etc/udev/rules.d/70-polecal.rules",
     "/usr/local/bin/polecald",
     "/usr/local/bin/polecal-field",
+    "/usr/local/share/man/man1/polecal-field.1",
+    "/usr/local/share/man/man5/polecal.yaml.5",
+    "/usr/local/share/man/man8/polecald.8",
     "/opt/polecal/bin/polecald",
 )
 OPERATORS = ("/etc/polecal/polecal.yaml", "/etc/udev/rules.d/71-polecal-names.rules")
