@@ -132,7 +132,7 @@ def calibration(folder: Path) -> dict[str, Any] | None:
 def read_pass(path: Path) -> Kept:
     """Read a pass's file, also of a version that wrote less into it. Raises SessionError."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             blocks = {
                 (int(part), Kind(int(kind))): Moments(int(count), first, second)
                 for (part, kind), count, first, second in zip(

@@ -158,7 +158,7 @@ def make_parser() -> argparse.ArgumentParser:
     imported.add_argument("--config", type=Path, required=True, metavar="FILE", help="what it replays with")
     imported.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="the capture to make")
     export = verb(_export, "write a capture's bytes as raw serial dumps, a file a device")
-    export.add_argument("capture", type=Path, metavar="CAPTURE", help="its file")
+    export.add_argument("capture", type=Path, metavar="CAPTURE", help="its file, or its session's folder")
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the dumps go")
     doctor = verb(_doctor, "look for what is wrong with ports, devices, disk and clock")
     doctor.add_argument("--config", type=Path, metavar="FILE", help=f"else $POLECAL_CONFIG, else {_CONFIG}")

@@ -36,7 +36,7 @@ from polecal import PolecalError, __version__
 from polecal.daemon import recorder, reporting
 from polecal.daemon.decoded import Decoder
 from polecal.daemon.recorder import METADATA, RecorderError
-from polecal.daemon.sessions import CAPTURE
+from polecal.daemon.sessions import CAPTURES, captures_of
 
 REPAIR = "polecal.repair"
 """The metadata record of a capture that was not closed by the daemon that wrote it."""
@@ -86,8 +86,7 @@ def finalise(path: Path, leave_bytes: int = 0, *, decoded: bool = True) -> Final
     capture = recorder.read(path)
     try:
         with _alone(path.parent) as folder:
-            for left in path.parent.rglob(f".*{_PART}"):  # a crash in the midst of writing a file
-                left.unlink()
+            path.with_name(f".{path.name}{_PART}").unlink(missing_ok=True)  # of a crash in the midst of it
             free_bytes = shutil.disk_usage(path.parent).free
             if free_bytes - capture.size_bytes < leave_bytes:
                 raise OSError(errno.ENOSPC, "too little room on the disk")
@@ -235,8 +234,12 @@ class Finaliser:
         self._child: subprocess.Popen[bytes] | None = None
         self._closed = False
         self._log = structlog.get_logger()
-        for path in sorted((state_dir / "sessions").glob(f"*/{CAPTURE}")):
-            self._queue.put((path, False))
+        for folder in sorted((state_dir / "sessions").glob("*/")):
+            for left in folder.rglob(f".*{_PART}"):  # a crash in the midst of writing a file
+                if not left.match(f".{CAPTURES}{_PART}"):  # on which a process may still be at work
+                    left.unlink(missing_ok=True)
+            for path in captures_of(folder):
+                self._queue.put((path, False))
         self._thread = threading.Thread(target=self._work, name="finaliser")
 
     def __enter__(self) -> Self:

@@ -384,6 +384,7 @@ class Pipeline:
         elif laser.result is None:
             laser.dropped, self._choices = dropped, choices
             laser.estimate(everywhere=True)
+            self._compare()
             raise Refused(
                 f"without pass {choice.name} there is nothing left to calibrate from",
                 "keep another one first, or drive more: `polecal-field start --continue`",

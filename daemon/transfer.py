@@ -19,6 +19,7 @@ from polecal.daemon import recorder
 from polecal.daemon.config import SPAN, Config, dump
 from polecal.daemon.recorder import Record, Recorder, RecorderError
 from polecal.daemon.replay import BEGIN
+from polecal.daemon.sessions import captures_of
 from polecal.drivers.novatel_span import Framer as SpanFramer
 from polecal.drivers.port import BITS_PER_BYTE
 from polecal.drivers.sick_lms import Framer as LmsFramer
@@ -208,8 +209,15 @@ def line_rate(baud: int) -> float:
 def export_dumps(capture: Path, out: Path) -> list[Path]:
     """Write what each device said (``NAME.bin``) and was told (``NAME.tx.bin``), each with its arrivals.
 
-    Gives the paths of the dumps. Nothing is written over. Raises RecorderError.
+    Of a session's folder, each day's capture goes into a folder of its own where there are several. Gives
+    the paths of the dumps. Nothing is written over. Raises RecorderError.
     """
+    if capture.is_dir():
+        days = captures_of(capture)
+        if not days:
+            raise RecorderError(f"{capture}: there is no capture in it", "name a session's folder")
+        several = len(days) > 1
+        return [path for day in days for path in export_dumps(day, out / day.stem if several else out)]
     source = recorder.read(capture)
     files: dict[tuple[str, str], tuple[IO[bytes], IO[str]]] = {}
     paths = []
