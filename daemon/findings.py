@@ -29,6 +29,7 @@ State = Literal["ok", "warn", "fault", "unknown"]
 _POWER_UP_BAUD = 9600
 _BAD_SHARE = 0.01  # of frames, from which a line is bad
 _CLOCK_S = 1.0  # by which the host's clock may be off: it only names sessions
+_DAY_S, _ROLLOVER_S = 86400, 1024 * 604800  # GPS counts its weeks in 10 bits
 _NOVATEL_MARKS = (b"\xaa\x44", b"#", b"<OK", b"<ERROR", b"$GP")
 _JUMPER = "pins 7 and 8 joined in the laser's plug make its line RS-422, without that it is RS-232"
 
@@ -329,6 +330,9 @@ def _clock(found: SpanProbe) -> Check:
     off_s = (datetime.now(UTC) - ago - gps).total_seconds()
     if abs(off_s) <= _CLOCK_S:
         return ok(name, f"the host's clock agrees with GPS to {abs(off_s):.1f} s")
+    if (rollovers := round(abs(off_s) / _ROLLOVER_S)) and abs(abs(off_s) - rollovers * _ROLLOVER_S) < _DAY_S:
+        hint = "its firmware does not know this GPS week: update it (a calibration does not mind)"
+        return warn(name, f"the receiver's date is off by {1024 * rollovers} weeks", hint)
     return warn(
         name,
         f"the host's clock is {_long(abs(off_s))} {'ahead of' if off_s > 0 else 'behind'} GPS",

@@ -196,7 +196,7 @@ def _rose(slices: list[Mapping[str, Any]], need: Mapping[str, Any], done: str) -
         angle = 2 * math.pi * (index + 0.5) / len(slices)
         mark, style = _mark(part)
         cell = Text(f"{360 * index // len(slices):>3}°")
-        cell.append(f"{mark}{_amount(part, need)}", style=style)
+        cell.append(_amount(part, need, mark), style=style)
         aside = round(_ROSE_RADIUS_X * math.sin(angle))
         column = middle + aside if aside > 0 else middle + aside + 1 - cell.cell_len
         if aside == 0:
@@ -229,7 +229,7 @@ def _grid(slices: list[Mapping[str, Any]], need: Mapping[str, Any]) -> list[Text
                 line.append(mark, style=style)
             else:
                 line.append(f"{360 * index // len(slices):>3}°")
-                line.append(f"{mark}{_amount(slices[index], need):<6}", style=style)
+                line.append(f"{_amount(slices[index], need, mark):<7}", style=style)
         lines.append(line)
     return lines
 
@@ -330,16 +330,16 @@ def _mark(part: Mapping[str, Any]) -> tuple[str, str]:
     return _BEGUN if part.get("pole_returns") or part.get("passes") else _EMPTY
 
 
-def _amount(part: Mapping[str, Any], need: Mapping[str, Any]) -> str:
-    """Write what a slice has, or what it still needs: "412", "−63", "−1p"."""
+def _amount(part: Mapping[str, Any], need: Mapping[str, Any], mark: str) -> str:
+    """Write what a slice has, with a mark, or what it still needs: "✓412", "−63", "−1p"."""
     returns, passes = part.get("pole_returns"), part.get("passes")
     if not part.get("done") and isinstance(returns, int) and isinstance(passes, int):
         lacks = need.get("min_pole_returns", 0) - returns
         if lacks > 0:
-            return f"−{_count(lacks, 3)}"
+            return f"−{_count(lacks, 4)}"
         if (lacks := need.get("min_passes", 0) - passes) > 0:
-            return f"−{_count(lacks, 2)}p"
-    return _count(returns, 4)
+            return f"−{_count(lacks, 3)}p"
+    return mark + _count(returns, 4)
 
 
 def _spark(values: list[Any], most: int) -> str:

@@ -362,10 +362,12 @@ def test_a_lever_arm_of_zero_is_told(site, make_receiver):
 
 def test_a_wrong_host_clock_is_told(site, make_receiver):
     late = gps_now()
-    checks = site.checks(receiver=make_receiver(**late | {"gps_s0": late["gps_s0"] - 30}))
-    assert_only(checks, "clock", "warn", "30.", "s ahead of GPS", "timedatectl", code=1)
-    checks = site.checks(receiver=make_receiver(**late | {"gps_week": late["gps_week"] + 52}))
+    checks = site.checks(receiver=make_receiver(gps_s0=late["gps_s0"] - 300.0))
+    assert_only(checks, "clock", "warn", "5 minutes ahead of GPS", "timedatectl", code=1)
+    checks = site.checks(receiver=make_receiver(gps_week=late["gps_week"] + 52))
     assert_only(checks, "clock", "warn", "364 days behind GPS", code=1)
+    checks = site.checks(receiver=make_receiver(gps_week=late["gps_week"] - 1024))
+    assert_only(checks, "clock", "warn", "off by 1024 weeks", "firmware", code=1)
 
 
 def test_a_disk_that_is_full_or_soon_will_be_is_told(site, small_disk):
