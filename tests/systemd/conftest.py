@@ -37,9 +37,11 @@ shift 3
 mount -t proc proc proc
 """
 # the project at /mnt, which cannot be written to
+PROJECT = """
+mount --bind "$1" mnt && mount -o remount,ro,bind mnt
+"""
 CHROOT = """
 mount --rbind /dev dev
-mount --bind "$1" mnt && mount -o remount,ro,bind mnt
 chroot . /bin/sh -euc "cd /mnt; $2"
 """
 BOOT = """
@@ -54,7 +56,7 @@ mount -t devpts -o newinstance,ptmxmode=0666,mode=620 devpts dev/pts
 ln -s pts/ptmx dev/ptmx
 mkdir -p run/systemd/system
 printf '[Unit]\\nDefaultDependencies=no\\nWants=systemd-journald.service\\n' >run/systemd/system/test.target
-exec env -i container=other "PATH=$PATH" chroot . "$1" --system --unit=test.target --show-status=no
+exec env -i container=other "PATH=$PATH" chroot . "$2" --system --unit=test.target --show-status=no
 """
 EMULATED = """
 [Service]
@@ -111,7 +113,7 @@ class Image:
 
     def run(self, name, script, lower=None):
         """Run a script as root in a view of it, with this machine's network and the project at /mnt."""
-        enter = ["unshare", "--mount", "--pid", "--fork", "sh", "-c", VIEW + CHROOT]
+        enter = ["unshare", "--mount", "--pid", "--fork", "sh", "-c", VIEW + PROJECT + CHROOT]
         command = [*enter, *self.view(name, lower), ROOT, script]
         return _run(command, env=os.environ | PLAIN, timeout=600)
 
@@ -214,8 +216,8 @@ def machine(cgroup2, image):
     group.mkdir()
     namespaces = ["unshare", "-p", "-f", "-m", "-u", "-i", "-n", "-C", "--kill-child"]
     into = f'echo 0 >"{group}/cgroup.procs"; exec "$@"'
-    view = [*image.view("booted"), SYSTEMD]
-    boot = ["sh", "-c", into, "sh", *namespaces, "sh", "-c", VIEW + BOOT, *view]
+    view = [*image.view("booted"), ROOT, SYSTEMD]
+    boot = ["sh", "-c", into, "sh", *namespaces, "sh", "-c", VIEW + PROJECT + BOOT, *view]
     log = image.folder / "boot.log"
     with log.open("wb") as said, subprocess.Popen(boot, stderr=said, stdout=said, env=PLAIN) as outside:
         try:
