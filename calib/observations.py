@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polecal import PolecalError
-from polecal.calib.geometry import Array, rotation
+from polecal.calib.geometry import Array, rotation, rotation_entries
 
 PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw")
 """The six unknowns, in the order of every vector and covariance (m and rad)."""
@@ -49,9 +49,8 @@ class Mount:
     @property
     def vector(self) -> Array:
         """(6,) x, y, z in m and roll, pitch, yaw in rad."""
-        values = np.array(astuple(self), dtype=np.float64)
-        values[3:] = np.radians(values[3:])
-        return values
+        angles_rad = np.radians((self.roll_deg, self.pitch_deg, self.yaw_deg))
+        return np.array((self.x_m, self.y_m, self.z_m, *angles_rad), dtype=np.float64)
 
     @property
     def rotation(self) -> Array:
@@ -121,7 +120,10 @@ class Returns:
 
     def __getitem__(self, index: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Returns:
         known = {part.name: getattr(self, part.name) for part in fields(self)}
-        return Returns(**{name: array[index] for name, array in known.items() if array is not None})
+        if isinstance(index, slice):
+            return Returns(**{name: array[index] for name, array in known.items() if array is not None})
+        rows = np.flatnonzero(index) if index.dtype == bool else index
+        return Returns(**{name: array.take(rows, 0) for name, array in known.items() if array is not None})
 
     @property
     def motion(self) -> tuple[Array, Array, Array, Array] | None:
@@ -143,9 +145,10 @@ def points_body(range_m: Array, bearing_rad: Array, mount: Mount) -> Array:
 
 def points_nav(returns: Returns, mount: Mount) -> Array:
     """Give (N, 3) returns in n, m: Eq. 2."""
-    body = points_body(returns.range_m, returns.bearing_rad, mount)
-    turned: Array = (rotation(returns.rpy_rad) @ body[:, :, None])[:, :, 0]
-    return turned + returns.position_m
+    x, y, z = points_body(returns.range_m, returns.bearing_rad, mount).T
+    c = rotation_entries(returns.rpy_rad)
+    turned = [c[row] * x + c[row + 1] * y + c[row + 2] * z for row in (0, 3, 6)]
+    return np.stack(turned, axis=1) + returns.position_m
 
 
 def cost(returns: Returns, mount: Mount, pole_radius_m: float = 0.0) -> float:

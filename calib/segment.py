@@ -132,15 +132,14 @@ def even_ground(range_m: Array, bearing_rad: Array, down_m: Array) -> NDArray[np
     ``down_m`` is their z in n by a mount that may be off: then level ground looks like a plane over the
     sensor's own x and y, whatever the heading. What stands out from that plane is left out.
     """
-    plane = np.column_stack(
-        [np.ones(len(range_m)), range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)]
-    )
+    plane = np.stack([np.ones(len(range_m)), range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)])
     kept = np.ones(len(range_m), dtype=bool)
     for _ in range(_TRIMS):
         if np.count_nonzero(kept) < _FEWEST_GROUND:
             break
-        flat = np.linalg.lstsq(plane[kept], down_m[kept], rcond=None)[0]
-        residual = down_m - plane @ flat
+        part = plane[:, kept]
+        flat = np.linalg.lstsq(part @ part.T, part @ down_m[kept], rcond=None)[0]
+        residual = down_m - flat @ plane
         residual -= np.median(residual[kept])
         spread_m = 1.4826 * float(np.median(np.abs(residual[kept])))
         kept = np.abs(residual) <= max(_TRIM_SIGMAS * spread_m, _EVEN_M)

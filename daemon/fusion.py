@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polecal.calib import Kind, Mount, points_nav
-from polecal.calib.segment import Ground, Places, Reflector, reflectors
+from polecal.calib.segment import RETRO_REFLECTIVE, Ground, Places, Reflector, reflectors
 from polecal.daemon.config import Config, Laser
 from polecal.daemon.passes import PassBuilder, StoredPass, observed
 from polecal.daemon.trajectory import Trajectory
@@ -32,6 +33,7 @@ from polecal.drivers.sick_lms.scans import ENERGY, S14, VALUES
 
 LEVELS_MODE = 0x01  # measuring mode 01: 13 bits of range, 3 of reflectivity (sheet, 3.3)
 
+_BRIGHT_WORD = math.ceil(RETRO_REFLECTIVE * 7) << 13  # a word of that mode below it is no reflector's
 _SCANS = frozenset((VALUES, ENERGY, S14))  # by levels, or what it fell back to; by energy; of an S14
 _REVOLUTION_NS = round(REVOLUTION_S * 1e9)
 _MIRROR_DRIFT = 5e-3  # a motor, not a crystal: 75 Hz is 13.33 ms, the sheet's 148 µs word says 13.32 ms
@@ -96,12 +98,14 @@ class LaserChannel:
         self._bearing_rad = bearings_rad(count, laser.fov_deg, laser.resolution_deg)
         ages_s = beam_ages_s(laser.fov_deg, laser.resolution_deg, count)
         self._age_ns = np.round(ages_s * 1e9).astype(np.int64)
+        self._youngest_ns = int(self._age_ns.min())
         self._scan_revolutions = int(np.ceil(ages_s.max() / REVOLUTION_S))
         self._byte_ns = BITS_PER_BYTE * 1e9 / laser.baud
 
-    def feed(self, t_ns: int, data: bytes) -> None:
-        """Take a chunk that was read at host time ``t_ns``."""
-        for frame in self.framer.feed(data, t_ns):
+    def feed(self, t_ns: int, data: bytes) -> bool:
+        """Take a chunk that was read at host time ``t_ns``; say whether a telegram ended in it."""
+        frames = self.framer.feed(data, t_ns)
+        for frame in frames:
             if frame.command not in _SCANS:
                 continue
             try:
@@ -114,10 +118,13 @@ class LaserChannel:
                 self._take(frame, scan)
             else:
                 self.dropped[OTHER_VARIANT] += scan.count
+        return bool(frames)
 
     def _take(self, frame: Frame, scan: Scan) -> None:
         stx_ns = self._stx_ns(frame, scan)
         self._seen_ns = frame.t_first_ns if stx_ns is None else stx_ns
+        if self._on_scan is None and scan.code == VALUES and scan.values.max() < _BRIGHT_WORD:
+            return
         decoded = decode(scan, LEVELS_MODE)
         if self._on_scan is not None:
             self._on_scan(self._seen_ns, decoded)
@@ -162,7 +169,7 @@ class LaserChannel:
         """Place the scans whose poses are all there; give the passes that have ended."""
         while self._waiting and self._gps_clock.locked:  # a clock that starts anew is seconds off at first
             stx_gps_ns = self._gps_clock.to_device(self._waiting[0].stx_ns)
-            if stx_gps_ns - int(self._age_ns.min()) > self._trajectory.last_ns:
+            if stx_gps_ns - self._youngest_ns > self._trajectory.last_ns:
                 break
             self._place(self._waiting.popleft(), stx_gps_ns - self._age_ns)
         oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns

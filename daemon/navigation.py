@@ -8,12 +8,11 @@ faults is over only once there has been none for a while.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from polecal.daemon.config import Navigation as Settings
 from polecal.daemon.pulse import Pulse
@@ -114,7 +113,7 @@ class CourseWatch:
     def __init__(self) -> None:
         self.off_deg: float | None = None
         """Azimuth less course, -90 to 90, on the last straight; in reverse, less the course's reverse."""
-        self._seen: deque[tuple[int, float, float, bool]] = deque()
+        self._seen: deque[tuple[int, float, float, bool]] = deque()  # angles go on, over 360
 
     def forget(self) -> None:
         """Begin anew: the solution did."""
@@ -129,21 +128,24 @@ class CourseWatch:
         if seen and pose.gps_ns - seen[-1][0] < _STEP_NS:
             return
         north, east, _ = pose.velocity_ned_mps
-        fast = np.hypot(north, east) >= max(_SLOW_MPS, _SIGMAS * sigma_mps)
-        course_deg = float(np.degrees(np.arctan2(east, north)))
-        seen.append((pose.gps_ns, pose.azimuth_deg, course_deg, bool(fast)))
+        fast = math.hypot(north, east) >= max(_SLOW_MPS, _SIGMAS * sigma_mps)
+        azimuth_deg, course_deg = pose.azimuth_deg, math.degrees(math.atan2(east, north))
+        if seen:
+            _, azimuth_before_deg, course_before_deg, _ = seen[-1]
+            azimuth_deg = azimuth_before_deg + _wrapped(azimuth_deg - azimuth_before_deg)
+            course_deg = course_before_deg + _wrapped(course_deg - course_before_deg)
+        seen.append((pose.gps_ns, azimuth_deg, course_deg, fast))
         while pose.gps_ns - seen[0][0] > _STRAIGHT_NS + _STEP_NS:
             seen.popleft()
-        if pose.gps_ns - seen[0][0] < _STRAIGHT_NS or not all(each[3] for each in seen):
+        if pose.gps_ns - seen[0][0] < _STRAIGHT_NS:
             return
-        azimuth, course = (np.array([each[i] for each in seen]) for i in (1, 2))
-        if np.ptp(_wrapped(azimuth - azimuth[0])) > _TURN_DEG:
+        _, azimuths_deg, courses_deg, fasts = zip(*seen, strict=True)
+        if not all(fasts) or max(azimuths_deg) - min(azimuths_deg) > _TURN_DEG:
             return
-        if np.ptp(_wrapped(course - course[0])) > _SWING_DEG:
+        if max(courses_deg) - min(courses_deg) > _SWING_DEG:
             return
-        swing = _wrapped(azimuth - course)
-        off_deg = float(_wrapped(swing[0] + np.mean(_wrapped(swing - swing[0]))))
-        self.off_deg = off_deg if abs(off_deg) <= 90 else off_deg - np.copysign(180.0, off_deg)
+        off_deg = _wrapped((sum(azimuths_deg) - sum(courses_deg)) / len(seen))
+        self.off_deg = off_deg if abs(off_deg) <= 90 else off_deg - math.copysign(180.0, off_deg)
 
 
 class Navigation:
@@ -176,12 +178,14 @@ class Navigation:
         self._type: tuple[int, PositionType | int, bool] | None = None  # of the inertial solution itself?
         self._accuracy: tuple[int, Accuracy] | None = None
 
-    def feed(self, t_ns: int, data: bytes) -> None:
-        """Take a chunk that was read at host time ``t_ns`` (CLOCK_MONOTONIC ns)."""
+    def feed(self, t_ns: int, data: bytes) -> bool:
+        """Take a chunk that was read at host time ``t_ns`` (CLOCK_MONOTONIC ns); say if a frame ended."""
         self.tick(t_ns)
-        for frame in self.framer.feed(data, t_ns):
+        frames = self.framer.feed(data, t_ns)
+        for frame in frames:
             if frame.kind.checked and not frame.is_response and self._copies.is_new(frame):
                 self._take(frame)
+        return bool(frames)
 
     def tick(self, t_ns: int) -> None:
         """Let time go on to host time ``t_ns``, whether or not anything came."""
@@ -349,5 +353,5 @@ def name_of(value: InsStatus | PositionType | TimeStatus | int | None) -> str | 
     return f"unknown ({value})"
 
 
-def _wrapped(angle_deg: Any) -> Any:
+def _wrapped(angle_deg: float) -> float:
     return (angle_deg + 180.0) % 360.0 - 180.0

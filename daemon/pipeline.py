@@ -234,14 +234,14 @@ class Pipeline:
             return
         before = self.routine.state
         if device == SPAN:
-            self._navigation.feed(t_ns, data)
+            framed = self._navigation.feed(t_ns, data)
         elif device in self._lasers:
-            self._lasers[device].channel.feed(t_ns, data)
+            framed = self._lasers[device].channel.feed(t_ns, data)
         else:
             return
         self.tick(t_ns)
         news = self.routine.state is not before
-        for laser in self._lasers.values():
+        for laser in self._lasers.values() if framed else ():  # else nothing is there that was not before
             for stored in laser.channel.fuse():
                 self._take(laser, stored)
                 news = True
@@ -415,7 +415,11 @@ class Pipeline:
 
     def _advance(self, t_ns: int) -> None:
         state = self.routine.state
-        if (
+        if state is State.COLLECTING:
+            if self._navigation.lost:
+                why = "; ".join(self._navigation.why_not) or f"{name_of(self._navigation.ins_status)}"
+                self.routine.to(State.ALIGNING, t_ns, f"no good navigation solution for 2 s: {why}")
+        elif (
             state is State.CONNECTING
             and self._navigation.pulse.count
             and all(laser.pulse.count for laser in self._lasers.values())
@@ -423,9 +427,6 @@ class Pipeline:
             self.routine.to(State.ALIGNING, t_ns, "all devices stream")
         elif state is State.ALIGNING and self._navigation.ready:
             self.routine.to(State.COLLECTING, t_ns, "the navigation solution is good")
-        elif state is State.COLLECTING and self._navigation.lost:
-            why = "; ".join(self._navigation.why_not) or f"{name_of(self._navigation.ins_status)}"
-            self.routine.to(State.ALIGNING, t_ns, f"no good navigation solution for 2 s: {why}")
 
     def _take(self, laser: _LaserRun, stored: StoredPass) -> None:
         stored = replace(stored, quality=self._navigation.quality.over(*stored.facts.gps_ns))

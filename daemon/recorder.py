@@ -10,6 +10,7 @@ import threading
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, Literal, Self, cast
@@ -29,6 +30,7 @@ EVENTS = "/events"
 METADATA = "polecal"
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _DAMAGE = (McapError, ValueError, struct.error, ZstdError)  # what the package raises on senseless bytes
 _CUT_OFF = "is cut off"
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -346,15 +348,15 @@ class _Cut(Exception):
 
 def _parse(opcode: int, body: bytes) -> list[Channel | Message]:
     """Take the channels and messages out of one record. Raises _Cut."""
-    stream = ReadDataStream(BytesIO(body))
     try:
         match opcode:
-            case Opcode.MESSAGE:
-                return [Message.read(stream, len(body))]
+            case Opcode.MESSAGE:  # nearly all there is: `Message.read` takes twice as long
+                channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+                return [Message(channel, log_time, body[_MESSAGE_HEAD.size :], publish_time, sequence)]
             case Opcode.CHANNEL:
-                return [Channel.read(stream)]
+                return [Channel.read(ReadDataStream(BytesIO(body)))]
             case Opcode.CHUNK:
-                inside = breakup_chunk(Chunk.read(stream), validate_crc=True)
+                inside = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
                 return [record for record in inside if isinstance(record, Channel | Message)]
     except _DAMAGE as error:
         raise _Cut(f"is damaged ({error})") from error
@@ -363,12 +365,17 @@ def _parse(opcode: int, body: bytes) -> list[Channel | Message]:
 
 def _item(message: Message, channel: Channel) -> Record | Event | None:
     """Say what a message is, None for those that were not recorded but decoded. Raises _Cut."""
-    try:
-        if channel.topic == EVENTS:
+    if channel.topic == EVENTS:
+        try:
             return Event(message.log_time, json.loads(message.data))
-    except ValueError as error:
-        raise _Cut(f"is damaged ({error})") from error
-    device, _, direction = channel.topic.removeprefix("/").rpartition("/")
-    if channel.message_encoding != RAW or direction not in ("rx", "tx"):
-        return None
-    return Record(device, cast(Direction, direction), message.log_time, message.data)
+        except ValueError as error:
+            raise _Cut(f"is damaged ({error})") from error
+    line = _line(channel.topic) if channel.message_encoding == RAW else None
+    return None if line is None else Record(*line, message.log_time, message.data)
+
+
+@cache
+def _line(topic: str) -> tuple[str, Direction] | None:
+    """Tell the device and the direction that a topic is of."""
+    device, _, direction = topic.removeprefix("/").rpartition("/")
+    return (device, cast(Direction, direction)) if direction in ("rx", "tx") else None

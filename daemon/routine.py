@@ -20,6 +20,8 @@ class State(StrEnum):
     REJECTED = "rejected"
     FAULT = "fault"
 
+    __hash__ = str.__hash__  # looked up with every chunk
+
 
 ENDED = frozenset({State.IDLE, State.ACCEPTED, State.REJECTED, State.FAULT})
 """In these nothing runs."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,9 @@ class Trajectory:
         self.origin: tuple[float, float, float] | None = None
         """Latitude, longitude (degrees) and ellipsoidal height (m) of n's origin."""
         self._gap_ns = int(_LONGEST_GAP * period_s * 1e9)
+        self._last_ns, self._last_yaw_rad = 0, 0.0
+        self._new: list[tuple[float, ...]] = []  # latitude, longitude, height; roll, pitch, yaw: not in n yet
+        self._new_ns: list[int] = []
         self._count = 0
         self._gps_ns = np.zeros(2 * _KEPT, dtype=np.int64)
         self._state = np.zeros((2 * _KEPT, 6))
@@ -48,58 +52,77 @@ class Trajectory:
     @property
     def last_ns(self) -> int:
         """GPS time of the newest pose, ns."""
-        return int(self._gps_ns[self._count - 1]) if self._count else 0
+        return self._last_ns
 
     def add(self, pose: NavState) -> None:
         """Take the next good pose; one that is not newer than the last is passed over."""
+        yaw_rad = math.radians(pose.azimuth_deg)
         if self.origin is None:
             self.origin = (pose.lat_deg, pose.lon_deg, pose.height_m)
-        if pose.gps_ns <= self.last_ns:
+            self._last_yaw_rad = yaw_rad
+        if pose.gps_ns <= self._last_ns:
             return
-        if self._count == 2 * _KEPT:
-            self._gps_ns[:_KEPT] = self._gps_ns[_KEPT:]
-            self._state[:_KEPT] = self._state[_KEPT:]
-            self._count = _KEPT
-        ned = pymap3d.geodetic2ned(pose.lat_deg, pose.lon_deg, pose.height_m, *self.origin)
-        rpy = np.radians((pose.roll_deg, pose.pitch_deg, pose.azimuth_deg))
-        if self._count:  # yaw goes on where it was, so that it can be interpolated across north
-            last = self._state[self._count - 1, 5]
-            rpy[2] = last + (rpy[2] - last + np.pi) % (2 * np.pi) - np.pi
-        self._gps_ns[self._count] = pose.gps_ns
-        self._state[self._count] = (*(float(value) for value in ned), *rpy)
-        self._count += 1
+        # yaw goes on where it was, so that it can be interpolated across north
+        turned_rad = (yaw_rad - self._last_yaw_rad + math.pi) % (2 * math.pi) - math.pi
+        self._last_ns, self._last_yaw_rad = pose.gps_ns, self._last_yaw_rad + turned_rad
+        angles_rad = math.radians(pose.roll_deg), math.radians(pose.pitch_deg), self._last_yaw_rad
+        self._new_ns.append(pose.gps_ns)
+        self._new.append((pose.lat_deg, pose.lon_deg, pose.height_m, *angles_rad))
+        if len(self._new) == _KEPT:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Bring the new poses into n: of all that came since the last look at once, which is much faster."""
+        if not self._new:
+            return
+        new = np.array(self._new)
+        new[:, :3] = np.column_stack(pymap3d.geodetic2ned(*new[:, :3].T, *(self.origin or ())))
+        if self._count + len(new) > 2 * _KEPT:
+            kept = slice(max(0, self._count - _KEPT), self._count)
+            self._count = kept.stop - kept.start
+            self._gps_ns[: self._count] = self._gps_ns[kept]
+            self._state[: self._count] = self._state[kept]
+        rows = slice(self._count, self._count + len(new))
+        self._gps_ns[rows], self._state[rows] = self._new_ns, new
+        self._count = rows.stop
+        self._new, self._new_ns = [], []
 
     def at(self, gps_ns: Times) -> Poses:
         """Interpolate at (N,) GPS times that are not newer than the newest pose."""
-        if self._count < 2:
+        self._settle()
+        if self._count < 2 or not len(gps_ns):
             nothing = np.zeros((len(gps_ns), 3))
             return Poses(np.zeros(len(gps_ns), dtype=bool), *[nothing] * 6)
-        known, state, rate = self._interpolated(gps_ns)
         first_ns, last_ns = self._gps_ns[0], self._gps_ns[self._count - 1]
         early_ns, late_ns = (np.clip(gps_ns + side, first_ns, last_ns) for side in (-_ASIDE_NS, _ASIDE_NS))
-        (_, early, early_rate), (_, late, late_rate) = map(self._interpolated, (early_ns, late_ns))
+        known, state, rate = self._interpolated(np.concatenate([gps_ns, early_ns, late_ns]))
+        turning = _body_rate(state[:, 3:], rate[:, 3:])
+        here, early, late = (slice(k * len(gps_ns), (k + 1) * len(gps_ns)) for k in range(3))
         apart_s = np.maximum(late_ns - early_ns, 1)[:, None] * 1e-9
-        turning = _body_rate(late[:, 3:], late_rate[:, 3:]) - _body_rate(early[:, 3:], early_rate[:, 3:])
         return Poses(
-            known=known,
-            position_m=state[:, :3],
-            rpy_rad=state[:, 3:],
-            velocity_mps=rate[:, :3],
-            rate_radps=_body_rate(state[:, 3:], rate[:, 3:]),
-            acceleration_mps2=(late_rate[:, :3] - early_rate[:, :3]) / apart_s,
-            angular_acceleration_radps2=turning / apart_s,
+            known=known[here],
+            position_m=state[here, :3],
+            rpy_rad=state[here, 3:],
+            velocity_mps=rate[here, :3],
+            rate_radps=turning[here],
+            acceleration_mps2=(rate[late, :3] - rate[early, :3]) / apart_s,
+            angular_acceleration_radps2=(turning[late] - turning[early]) / apart_s,
         )
 
     def _interpolated(self, gps_ns: Times) -> tuple[NDArray[np.bool_], Array, Array]:
         """Give where it is known, the state (N, 6) and its rate of change: straight lines between poses."""
-        times = self._gps_ns[: self._count]
-        after = np.clip(np.searchsorted(times, gps_ns), 1, self._count - 1)
-        before = after - 1
-        span_ns = times[after] - times[before]
-        part_ns = gps_ns - times[before]
+        first, last = np.searchsorted(self._gps_ns[: self._count], (gps_ns.min(), gps_ns.max()))
+        start = max(0, min(int(first), self._count - 1) - 1)
+        rows = slice(start, min(max(int(last) + 1, start + 2), self._count))
+        times, states = self._gps_ns[rows], self._state[rows]
+        spans_ns = np.diff(times)
+        rates = np.diff(states, axis=0) / (spans_ns * 1e-9)[:, None]
+        before = np.clip(np.searchsorted(times, gps_ns), 1, len(times) - 1) - 1
+        span_ns = spans_ns.take(before)
+        part_ns = gps_ns - times.take(before)
         known = (span_ns <= self._gap_ns) & (part_ns >= 0) & (part_ns <= span_ns)
-        rate = (self._state[after] - self._state[before]) / (span_ns * 1e-9)[:, None]
-        return known, self._state[before] + rate * (part_ns * 1e-9)[:, None], rate
+        rate = rates.take(before, axis=0)
+        return known, states.take(before, axis=0) + rate * (part_ns * 1e-9)[:, None], rate
 
 
 def _body_rate(rpy_rad: Array, rpy_rate_radps: Array) -> Array:

@@ -14,6 +14,7 @@ the drift. On the same stamps, USB timer 16 ms and ±50 ppm, the hull's p99 is 0
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 _JUMP_NS = 500_000_000  # no line delay: one of the two clocks was set, or the device started again
@@ -37,13 +38,17 @@ class _Hull:
         self.x.append(x)
         self.y.append(y)
 
-    def slope(self) -> float:
-        """Give the slope of the edge over the middle."""
-        middle = (self.x[0] + self.x[-1]) / 2
-        for index in range(1, len(self.x)):
-            if self.x[index] >= middle:
-                return (self.y[index] - self.y[index - 1]) / (self.x[index] - self.x[index - 1])
-        return 0.0
+    def line(self, steepest: float) -> tuple[float, float]:
+        """Give slope and offset of the line through the edge over the middle, or no steeper below it."""
+        if len(self.x) < 2:
+            return 0.0, float(self.y[0])
+        edge = max(1, bisect_left(self.x, (self.x[0] + self.x[-1]) / 2))
+        (x0, x1), (y0, y1) = self.x[edge - 1 : edge + 1], self.y[edge - 1 : edge + 1]
+        slope = (y1 - y0) / (x1 - x0)
+        if abs(slope) <= steepest:  # of an edge of the hull all other points lie above its line
+            return slope, min(y0 - slope * x0, y1 - slope * x1)
+        slope = max(-steepest, min(steepest, slope))
+        return slope, min(y - slope * x for x, y in zip(self.x, self.y, strict=True))
 
 
 class Clock:
@@ -97,8 +102,7 @@ class Clock:
         self._old.add(x, y)
         if x - self._first_ns >= self._half_ns:
             self._young.add(x, y)
-        self._slope = max(-self._max_drift, min(self._max_drift, self._old.slope()))
-        self._offset_ns = min(yi - self._slope * xi for xi, yi in zip(self._old.x, self._old.y, strict=True))
+        self._slope, self._offset_ns = self._old.line(self._max_drift)
 
     def to_host(self, device_ns: float) -> int:
         """Give the host's time at a device time, ns."""

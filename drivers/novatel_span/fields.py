@@ -133,6 +133,10 @@ class Layout:
             values.append(tuple(items))
         return self.cls(*values), at
 
+    def numbers(self, body: bytes) -> tuple[Any, ...]:
+        """Read the bare numbers of a body of a fixed layout. Raises struct.error on a short one."""
+        return self._struct.unpack_from(body)
+
     def scan(self, tokens: Iterator[str]) -> Any:
         """Read one object from ASCII fields. Raises ValueError, StopIteration on a bad line."""
         values = []

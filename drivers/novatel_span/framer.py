@@ -50,6 +50,8 @@ class Kind(Enum):
     PROMPT = "prompt"
     NMEA = "nmea"
 
+    __hash__ = object.__hash__  # of itself, as it is equal to nothing else: it is looked up often
+
     @property
     def checked(self) -> bool:
         """Whether such a frame carries a checksum."""
@@ -94,14 +96,14 @@ class Frame:
     @property
     def message_id(self) -> int | None:
         """The log's id; None where the kind has none or the name is not in `MessageId`."""
-        if self.kind in _BINARY_KINDS:
+        if self.kind in BINARY_KINDS:
             return int.from_bytes(self.data[4:6], "little")
         return MessageId.__members__.get(self.name or "")
 
     @property
     def name(self) -> str | None:
         """The log's name without its format letter ("INSPVAX"); None for replies, prompts and NMEA."""
-        if self.kind in _BINARY_KINDS:
+        if self.kind in BINARY_KINDS:
             number = named(MessageId, int.from_bytes(self.data[4:6], "little"))
             return number.name if isinstance(number, MessageId) else f"MESSAGE_{number}"
         if self.kind in _ASCII_KINDS:
@@ -174,7 +176,7 @@ class Frame:
     @property
     def text(self) -> str:
         """A text frame's line without its end; "OK" or "ERROR:..." of a reply, of a prompt its port."""
-        if self.kind in _BINARY_KINDS:
+        if self.kind in BINARY_KINDS:
             return ""
         line = self.data.decode("ascii", "replace").strip("\r\n")
         return line.strip("<[]") if self.kind in (Kind.REPLY, Kind.PROMPT) else line
@@ -203,7 +205,7 @@ class Frame:
         return self.data[1 : self.data.index(b";")].decode("ascii").split(",")
 
 
-_BINARY_KINDS = frozenset({Kind.BINARY, Kind.SHORT_BINARY, Kind.PROPRIETARY})
+BINARY_KINDS = frozenset({Kind.BINARY, Kind.SHORT_BINARY, Kind.PROPRIETARY})
 _ASCII_KINDS = frozenset({Kind.ASCII, Kind.SHORT_ASCII})
 
 
@@ -236,7 +238,8 @@ _SYNCS = {
 }
 
 
-def _binary(buffer: bytes, at: int) -> _Match:
+def _extent(buffer: bytes, at: int) -> _Match:
+    """Tell the kind of the binary frame at ``at``, and where it will end by its header."""
     have = len(buffer) - at
     sync = buffer[at : at + 3]
     kind = _SYNCS.get(sync)
@@ -253,11 +256,17 @@ def _binary(buffer: bytes, at: int) -> _Match:
         if header_bytes < LONG_HEADER_BYTES:
             return Fault.LENGTH
     end = at + header_bytes + body_bytes + CRC_BYTES
-    if end - at > MAX_FRAME_BYTES:
-        return Fault.LENGTH
+    return (kind, end) if end - at <= MAX_FRAME_BYTES else Fault.LENGTH
+
+
+def _binary(buffer: bytes, at: int) -> _Match:
+    match = _extent(buffer, at)
+    if not isinstance(match, tuple):
+        return match
+    _, end = match
     if end > len(buffer):
         return None
-    return (kind, end) if crc32(buffer[at:end]) == 0 else Fault.CRC  # over its own CRC too it is 0
+    return match if crc32(buffer[at:end]) == 0 else Fault.CRC  # over its own CRC too it is 0
 
 
 def _line(buffer: bytes, at: int, most: int) -> tuple[int, int] | Fault | None:
@@ -367,6 +376,7 @@ class Framer:
         """Candidates that looked like a frame and failed: wrong checksum or length, cut off."""
         self._on_skip = on_skip
         self._rest = b""
+        self._announced = 0  # how long the frame will be that _rest is the beginning of, where that is known
         self._offset = 0  # of the first byte of _rest in the stream
         self._chunks: deque[tuple[int, int]] = deque()  # (offset behind its last byte, stamp)
 
@@ -374,6 +384,9 @@ class Framer:
         """Take a chunk with its stamp (CLOCK_MONOTONIC, ns); return the frames that ended in it."""
         buffer = self._rest + data
         self._chunks.append((self._offset + len(buffer), t_ns))
+        if len(buffer) < self._announced:  # most chunks end within a frame
+            self._rest = buffer
+            return []
         frames: list[Frame] = []
         junk_at, reason = 0, Fault.NOISE  # where the bytes begin that belong to no frame, and why
         at = 0
@@ -398,6 +411,8 @@ class Framer:
             at = len(buffer)
         self._skip(buffer, junk_at, at, reason)
         self._rest = buffer[at:]
+        extent = _extent(self._rest, 0) if self._rest.startswith(b"\xaa") else None
+        self._announced = extent[1] if isinstance(extent, tuple) else 0
         self._offset += at
         while self._chunks and self._chunks[0][0] <= self._offset:
             self._chunks.popleft()
@@ -408,6 +423,7 @@ class Framer:
         self._skip(self._rest, 0, len(self._rest), Fault.END)
         self._offset += len(self._rest)
         self._rest = b""
+        self._announced = 0
         self._chunks.clear()
 
     def _frame(self, data: bytes, offset: int, kind: Kind) -> Frame:

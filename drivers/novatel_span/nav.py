@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections import deque
 from dataclasses import dataclass
 
@@ -13,8 +14,10 @@ from polecal.drivers.novatel_span.enums import (
     OffsetFrame,
     PositionType,
     SolutionStatus,
+    named,
 )
-from polecal.drivers.novatel_span.framer import Frame
+from polecal.drivers.novatel_span.fields import layout
+from polecal.drivers.novatel_span.framer import BINARY_KINDS, Frame
 from polecal.drivers.novatel_span.logs import (
     BestPos,
     InsConfig,
@@ -27,6 +30,8 @@ from polecal.drivers.novatel_span.logs import (
 
 WEEK_NS = 604_800 * 10**9
 Triple = tuple[float, float, float]
+
+_INSPVA = layout(InsPva)
 
 POSE_LOGS = frozenset(
     {
@@ -133,6 +138,8 @@ def nav_state(frame: Frame) -> NavState | None:
     """
     if frame.message_id not in POSE_LOGS or frame.is_response:
         return None
+    if frame.kind in BINARY_KINDS and frame.message_id != MessageId.INSPVAX:
+        return _plain_state(frame)
     pose = parse(frame)
     position_type = position_sigma_m = velocity_sigma_mps = attitude_sigma_deg = None
     if isinstance(pose, InsPva):
@@ -163,6 +170,21 @@ def nav_state(frame: Frame) -> NavState | None:
         attitude_sigma_deg,
         frame.name or "",
     )
+
+
+def _plain_state(frame: Frame) -> NavState | None:
+    """Do the same for what comes most, a binary INSPVA or its like, in a third of the time."""
+    try:
+        numbers = _INSPVA.numbers(frame.body)
+    except struct.error:
+        return None
+    week, seconds_s, lat, lon, height, north, east, up, roll, pitch, azimuth, status = numbers
+    if not math.isfinite(sum(numbers[1:-1])):
+        return None
+    return NavState(
+        gps_ns(week, seconds_s), lat, lon, height, (north, east, -up), roll, pitch, azimuth,
+        named(InsStatus, status), None, None, None, None, frame.name or "",
+    )  # fmt: skip
 
 
 def reference_point(config: InsConfig | None) -> str:

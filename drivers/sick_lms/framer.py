@@ -88,6 +88,7 @@ class Framer:
         self._start = 0  # offset of the first held byte in the stream
         self._ends: list[int] = []  # of each chunk still held, the offset of its end,
         self._stamps: list[int] = []  # and its stamp
+        self._telegram_end = 0  # of what is held, if that is nothing but the beginning of a telegram
         self._in_step = True  # nothing but whole telegrams, ACKs and NAKs so far
         self._bad_until = 0
         self._verdicts: dict[int, bool] = {}  # on what stands behind an ACK, by offset: asked many times
@@ -96,10 +97,15 @@ class Framer:
         """Take the next bytes of the stream, read at ``t_ns``; return the telegrams that are now whole."""
         if not data:
             return []
+        at = len(self._held)
         self._held += data
         self._ends.append(self._start + len(self._held))
         self._stamps.append(t_ns)
-        return self._scan(final=False)
+        if len(self._held) < self._telegram_end and self._held.find(_ACK_STX, at - 1) < 0:
+            return []  # most chunks end within a telegram
+        frames = self._scan(final=False)
+        self._telegram_end = self._undisturbed_end()
+        return frames
 
     def close(self) -> list[Frame]:
         """Wait no longer for the rest of what is held: the line is silent, or the file at its end.
@@ -107,7 +113,7 @@ class Framer:
         Returns the telegrams that stood behind a false start. The stream may go on afterwards.
         """
         frames = self._scan(final=True)
-        self._in_step = True
+        self._in_step, self._telegram_end = True, 0
         return frames
 
     def _scan(self, *, final: bool) -> list[Frame]:
@@ -151,6 +157,12 @@ class Framer:
         done = bisect_right(self._ends, self._start)
         del self._ends[:done], self._stamps[:done]
         return frames
+
+    def _undisturbed_end(self) -> int:
+        """Where the telegram will end that is held, 0 if what is held needs another look with each byte."""
+        if len(self._held) < 4 or self._held[0] != STX or _ACK_STX in self._held:
+            return 0
+        return self._end(0) or 0
 
     def _judge(self, at: int, *, final: bool) -> tuple[Reason | None, int]:
         """Say what is wrong with the telegram that may begin at ``at``, and where it ends.
