@@ -26,6 +26,9 @@ MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
 _LAST_PASSES = 3  # the rate of improvement is what these brought
 _FEWEST_POLE_RETURNS = 10
 _FEWEST_TO_DISAGREE = 6
+_FARTHEST_M = 1000.0  # of any range: a laser in millimetres would be beyond
+_FARTHEST_ORIGIN_M = 1e5  # squares of what is farther leave no digits for the millimetre
+_MOST_TURNED_RAD = 4 * np.pi
 _MOST_SET_ASIDE = 0.25  # of all passes: where more disagree, it is not they that are wrong
 _LEAST_M = 0.02  # of √c: what few passes fit better than their returns are is fitted too well
 _FARTHEST = 20.0  # σ of the hand measurement: beyond, there is no such mount
@@ -68,6 +71,19 @@ class Setup:
     hold: frozenset[str] = frozenset()
     criteria: Criteria = field(default_factory=Criteria)
     need: Need = field(default_factory=Need)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be calibrated from. Raises CalibrationError."""
+        faults = [
+            (not np.isfinite(self.measured.vector).all(), "the measured mount is not finite"),
+            (not (self.measured_sigma.vector > 0).all(), "the measured mount's σ is not above 0"),
+            (not 0 <= self.pole_radius_m < np.inf, f"a pole's radius cannot be {self.pole_radius_m:g} m"),
+            (not self.hold <= set(PARAMETERS), f"hold has names that are none of {', '.join(PARAMETERS)}"),
+            (not self.extras <= set(EXTRAS), f"extras has names that are none of {', '.join(EXTRAS)}"),
+        ]
+        for fault, what in faults:
+            if fault:
+                raise CalibrationError(what, "correct what calibrate was given")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +182,7 @@ def calibrate(
         Where there are not enough pole returns to speak of.
     """
     need = need or Need()
+    _refuse_absurd(returns)
     passes = passes_of(returns, need.slice_deg, timed="time_s" in extras)
     setup = Setup(
         measured=mount,
@@ -180,19 +197,40 @@ def calibrate(
     return estimate(passes, setup, everywhere=True)
 
 
+def _refuse_absurd(returns: Returns) -> None:
+    """Refuse what no laser and no local frame gives, units mistaken foremost. Raises CalibrationError."""
+    if not len(returns):
+        raise CalibrationError("there are no returns", "record a pass of the pole")
+    if returns.range_m.min() <= 0 or returns.range_m.max() > _FARTHEST_M:
+        raise CalibrationError(
+            f"range_m goes from {returns.range_m.min():g} to {returns.range_m.max():g}",
+            f"it must be above 0 and up to {_FARTHEST_M:g}, in metres; leave out beams without a range",
+        )
+    if np.abs(returns.position_m).max() > _FARTHEST_ORIGIN_M:
+        raise CalibrationError(
+            f"position_m goes up to {np.abs(returns.position_m).max():g}: no digits left for millimetres",
+            "take north, east and down in metres from a point near the pole",
+        )
+    if (
+        np.abs(returns.rpy_rad).max() > _MOST_TURNED_RAD
+        or np.abs(returns.bearing_rad).max() > _MOST_TURNED_RAD
+    ):
+        raise CalibrationError("rpy_rad or bearing_rad goes beyond two turns", "give radians, not degrees")
+
+
 @one_thread
 def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) -> Result:
     """Find the mount from passes; ``everywhere`` looks for lower minima far from the hand measurement, too.
 
     Raises CalibrationError where there are fewer than 10 pole returns.
     """
-    problem = _Problem(passes, setup)
-    pole_returns = int(problem.pole.count.sum())
+    pole_returns = sum(sum(one.pole_returns.values()) for one in passes)
     if pole_returns < _FEWEST_POLE_RETURNS:
         raise CalibrationError(
             f"{pole_returns} pole returns are too few to calibrate from",
             "drive past the pole; if that was done, check its tape and that the laser's reflectivity is on",
         )
+    problem = _Problem(passes, setup)
     used = np.ones(len(passes), dtype=bool)
     set_aside: dict[int, str] = {}
     while True:
@@ -321,7 +359,9 @@ class _Problem:
         improvement = doubling = None
         if len(passes) > max(_LAST_PASSES, FEWEST_PASSES) and cost_m:
             # Halves that have seen as much: from every heading every other pass.
-            turned = sorted(order.tolist(), key=lambda number: min(self._passes[number].pole_returns))
+            turned = sorted(
+                order.tolist(), key=lambda number: min(self._passes[number].pole_returns, default=0)
+            )
             some = (order[:-_LAST_PASSES].tolist(), turned[::2], turned[1::2])
             last, *halves = (
                 solve.cost_m(paper, self._minimum_of(numbers, found)) / cost_m - 1.0 for numbers in some

@@ -92,9 +92,16 @@ class Returns:
     """(N, 3) rate of change of the angular velocity, in b, rad/s²."""
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together."""
-        n = len(self.range_m)
+        """Refuse what are not arrays of numbers that fit together."""
+        for part in fields(self):
+            array = getattr(self, part.name)
+            numbers = "iu" if part.name in ("kind", "pass_id") else "fiu"
+            if array is not None and not (isinstance(array, np.ndarray) and array.dtype.kind in numbers):
+                kinds = "whole numbers" if numbers == "iu" else "numbers"
+                raise CalibrationError(f"{part.name} is not a NumPy array of {kinds}", "convert it first")
+        n = len(np.atleast_1d(self.range_m))
         wanted = {
+            "range_m": (n,),
             "bearing_rad": (n,),
             "position_m": (n, 3),
             "rpy_rad": (n, 3),
@@ -109,11 +116,14 @@ class Returns:
             array = getattr(self, name)
             if array is not None and np.shape(array) != shape:
                 raise CalibrationError(f"{name} has shape {np.shape(array)}, not {shape}", "one row a return")
-        for name in ("range_m", "bearing_rad", "position_m", "rpy_rad"):
-            if not np.isfinite(getattr(self, name)).all():
+            if array is not None and not np.isfinite(array).all():
                 raise CalibrationError(
                     f"{name} holds values that are not finite", "leave out beams without a range"
                 )
+        if np.isin(self.kind, list(Kind), invert=True).any():
+            raise CalibrationError(
+                "kind holds values that are neither pole (0) nor ground (1)", "leave them out"
+            )
 
     def __len__(self) -> int:
         return len(self.range_m)

@@ -108,7 +108,7 @@ class Scatter:
     def within(self, rows: Array) -> Array:
         """Give each pass's variance within, (P,), m², the mean over the given rows (k, 108)."""
         summed = np.einsum("ki,pij,kj->p", rows, self._within, rows)
-        within: Array = summed / np.maximum(1.0, self.count) / len(rows)
+        within: Array = np.maximum(0.0, summed) / np.maximum(1.0, self.count) / len(rows)
         return within
 
     def ratio(self, rows: Array, used: NDArray[np.bool_]) -> float:
