@@ -18,6 +18,7 @@ _DULL = 0.3  # up to here it is from soil, grass or walls
 _STEP_M = 0.3  # along one object the range does not jump by more
 _SPREAD_M = 0.03  # beam width and range noise add to what an object looks like
 _SPREAD_BEAMS = 3
+_BEHIND_M = 0.05  # more than range noise, and than the levels by which ranges are told
 _MARGIN_BEAMS = 2  # next to a reflector a beam sees half of each
 _GROUND_BAND_M = 0.5
 _GROUND_RANGE_M = 30.0
@@ -53,11 +54,17 @@ def reflectors(
     apart = (np.diff(bright) > _MARGIN_BEAMS) | (np.abs(np.diff(range_m[bright])) > _STEP_M)
     step_rad = abs(float(bearing_rad[1] - bearing_rad[0]))
     found = []
-    for beams in np.split(bright, np.flatnonzero(apart) + 1):
+    for together in np.split(bright, np.flatnonzero(apart) + 1):
+        beams = together
         distance_m = float(range_m[beams].mean())
         width_m = distance_m * (abs(float(bearing_rad[beams[-1]] - bearing_rad[beams[0]])) + step_rad)
         widest_m = 2 * pole_radius_m + _SPREAD_BEAMS * step_rad * distance_m + _SPREAD_M
-        found.append(Reflector(beams, distance_m, width_m <= widest_m))
+        thin = width_m <= widest_m
+        if thin:  # a beam on its edge sees half of it and half of what is behind, at a range between
+            core_m = np.sort(range_m[beams])[(len(beams) - 1) // 2]
+            beams = beams[np.abs(range_m[beams] - core_m) <= pole_radius_m + _BEHIND_M]
+            distance_m = float(range_m[beams].mean())
+        found.append(Reflector(beams, distance_m, thin))
     return found
 
 

@@ -44,6 +44,33 @@ def test_beams_without_a_range_are_passed_over():
     assert reflectors(ranges, bearing, reflectivity, pole_radius_m=0.04) == []
 
 
+@pytest.mark.parametrize("behind_m", [0.12, 0.2, 0.29])
+@pytest.mark.parametrize("core", [1, 2, 5])
+def test_bright_beams_on_the_poles_edges_that_mix_it_with_what_is_behind_are_no_part_of_it(core, behind_m):
+    """Between pole and background in range, and still as bright as tape: level 5 beside 7."""
+    edges = ((99, 1, 4.0 + behind_m, 0.72), (100 + core, 1, 4.0 + behind_m, 0.72))
+    (pole,) = found((100, core, 4.0, 1.0), *(edges if core > 1 else edges[:1]))
+    assert pole.beams.tolist() == list(range(100, 100 + core))
+    assert pole.range_m == pytest.approx(4.0)
+    assert pole.thin
+
+
+def test_mixed_beams_that_are_no_longer_bright_are_neither_pole_nor_ground():
+    ranges, bearing, reflectivity = scan((100, 3, 4.0, 1.0), (99, 1, 5.5, 0.5), (103, 1, 6.5, 0.2))
+    (pole,) = reflectors(ranges, bearing, reflectivity, pole_radius_m=0.04)
+    assert pole.beams.tolist() == [100, 101, 102]
+    ground = Ground().beams(ranges, reflectivity, np.zeros(401))
+    assert not set(ground) & {99, 103}
+
+
+def test_a_thick_poles_round_face_is_kept_whole():
+    across = np.linspace(-0.95, 0.95, 9)
+    ranges, bearing, reflectivity = scan((100, 9, 4.0, 1.0))
+    ranges[100:109] = 4.0 + 0.1 * (1 - np.sqrt(1 - across**2))
+    (pole,) = reflectors(ranges, bearing, reflectivity, pole_radius_m=0.1)
+    assert pole.beams.tolist() == list(range(100, 109))
+
+
 def test_sightings_go_to_the_nearest_place_or_make_one():
     places = Places()
     assert places.sight(np.array([3.0, 1.0]), 1.0, thin=True) == 0
