@@ -19,13 +19,14 @@ def passes(answer: Mapping[str, Any]) -> Iterator[Text]:
     """Give a PASSES object: a line a pass, and one more for each that is not used."""
     rows = answer["passes"]
     used = sum(row["use"] == "used" for row in rows)
-    yield Text(f"session {answer['session']}, {answer['state']}: {len(rows)} passes, {used} of them used")
+    passes = "1 pass" if len(rows) == 1 else f"{len(rows)} passes"
+    yield Text(f"session {answer['session']}, {answer['state']}: {passes}, {used} used")
     if not rows:
         return
     wide = max(len(row["name"]) for row in rows)
     yield Text(
-        f"{'pass':<{wide}} {'UTC':<8} {'s':>4} {'heading':>8} {'pole':>5} {'ground':>6} "
-        f"{'m/s':>4} {'':<5} {'near/mean':>9} {'off':>4} {'±mm':>3} {'σ m':>4}",
+        f"{'pass':<{wide}} {'UTC':<8} {'s':>3} {'heading':>7} {'pole':>5} {'ground':>6} "
+        f"{'m/s':>4} {'':<5} {'near/mean':>9} {'off':>4} {'±mm':>3} {'nav':>6}",
         style="bold",
     )
     day = None
@@ -40,13 +41,13 @@ def passes(answer: Mapping[str, Any]) -> Iterator[Text]:
 def _pass(row: Mapping[str, Any], wide: int) -> Iterator[Text]:
     pole, ground = (sum(part[kind] for part in row["slices"]) for kind in ("pole", "ground"))
     seconds = (row["gps_ns"][1] - row["gps_ns"][0]) / 1e9
-    heading = f"{row['heading_deg']:.0f}±{row['span_deg'] / 2:.0f}°"
+    heading = f"{round(row['heading_deg']) % 360}±{row['span_deg'] / 2:.0f}"
     near = f"{row['nearest_m']:.1f}/{row['mean_m']:.1f}"
-    sigma = _number(row["position_sigma_m"], 2)
+    nav = _nav(row)
     line = Text(
-        f"{row['name']:<{wide}} {row['start'][11:19]} {seconds:>4.1f} {heading:>8} {pole:>5} "
+        f"{row['name']:<{wide}} {row['start'][11:19]} {seconds:>3.0f} {heading:>7} {pole:>5} "
         f"{ground:>6} {abs(row['speed_mps']):>4.1f} {_DIRECTIONS.get(row['direction'], NONE):<5} "
-        f"{near:>9} {_mm(row['offset_m']):>4} {_mm(row['spread_m']):>3} {sigma:>4}",
+        f"{near:>9} {_mm(row['offset_m']):>4} {_mm(row['spread_m']):>3} {nav:>6}",
         style=_STYLES.get(row["use"], ""),
     )
     yield line
@@ -57,6 +58,14 @@ def _pass(row: Mapping[str, Any], wide: int) -> Iterator[Text]:
         notes.append(f"{row['unused_poses']} poses not used")
     for note in notes:
         yield Text(_short(f"{'':<{wide}} └ {note}", WIDTH), style="dim")
+
+
+def _nav(row: Mapping[str, Any]) -> str:
+    """Give what the navigation was worth at its worst: σ of position, or what the position rested on."""
+    if row["position_sigma_m"] is not None:
+        return f"±{row['position_sigma_m']:.2f}m"
+    told = str(row["position_type"] or NONE).removeprefix("INS_").removeprefix("RTK")
+    return _short(told.removeprefix("NARROW_"), 6)
 
 
 def change(answer: Mapping[str, Any]) -> Iterator[Text]:
@@ -115,13 +124,14 @@ def sessions(answer: Mapping[str, Any]) -> Iterator[Text]:
         yield Text("no session yet: start one by `polecal-field start`")
         return
     yield Text(
-        f"{'session':<33} {'state':<11} {'passes':>6} {'√c m':>12} {'MB':>7} {'days':>4} kept", style="bold"
+        f"{'session':<32} {'state':<11} {'passes':>6} {'√c m':>11} {'MB':>6} {'days':>4} {'kept':>4}",
+        style="bold",
     )
     for row in rows:
         costs = "/".join(_number(cost, 3) for cost in _values(row["cost_m"])) or NONE
         yield Text(
-            f"{_short(row['session'], 33):<33} {row['state']:<11} {row['passes']:>6} {costs:>12} "
-            f"{row['size_bytes'] / _MEGA:>7.1f} {row['captures']:>4} {'yes' if row['preserved'] else ''}"
+            f"{_short(row['session'], 32):<32} {row['state']:<11} {row['passes']:>6} {costs:>11} "
+            f"{row['size_bytes'] / _MEGA:>6.0f} {row['captures']:>4} {'yes' if row['preserved'] else '':>4}"
         )
         if row["problem"]:
             yield Text(_short(f"  └ {row['problem']}", WIDTH), style="red")
