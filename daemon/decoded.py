@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -32,11 +33,14 @@ from polecal.calib import Kind, Mount, Returns, cost, points_nav
 from polecal.calib.geometry import roll_pitch_yaw, rotation
 from polecal.daemon import config as configuration
 from polecal.daemon import foxglove
+from polecal.daemon.choices import name_of
 from polecal.daemon.config import SPAN
+from polecal.daemon.control import Refused
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Event, Record, RecorderError
 from polecal.daemon.replay import play
+from polecal.daemon.rows import OTHER
 from polecal.daemon.sessions import CALIBRATION
 from polecal.drivers.novatel_span import NavState
 from polecal.drivers.sick_lms import Decoded, beam_ages_s
@@ -77,44 +81,36 @@ POLE_PASS = {
     "title": "polecal.PolePass",
     "type": "object",
     "properties": {
+        "name": {"type": "string"},
         "laser": {"type": "string"},
         "id": {"type": "integer"},
         "place": {"type": "integer", "description": "which reflector it was: passes of one have the same"},
+        "use": {"type": "string", "description": "used, set aside, dropped, or of another reflector"},
         "begin": _TIME | {"description": "UTC of its first return"},
         "end": _TIME | {"description": "UTC of its last return"},
-        "heading_deg": {"type": "number", "description": "mean azimuth of the body"},
-        "speed_mps": {"type": "number", "description": "mean, forward; negative in reverse"},
+        "heading_deg": {"type": "number"},
+        "speed_mps": {"type": "number"},
+        "direction": {"type": "string"},
         "nearest_m": _METRES | {"description": "the shortest range to the pole"},
         "returns": {
             "type": "object",
             "properties": {"pole": _COUNT, "ground": _COUNT},
             "required": ["pole", "ground"],
         },
-        "slices": {
-            "type": "object",
-            "additionalProperties": _COUNT,
-            "description": "pole returns by slice of platform yaw",
-        },
+        "slices": {"type": "array", "description": "returns by slice of platform yaw"},
         "measured_cost_m": _METRES
         | {"description": "√c of Eq. 7 of this pass alone, by the mount as measured"},
-        "cost_m": {"anyOf": [_METRES, {"type": "null"}], "description": "the same, by the calibrated one"},
+        "calibrated_cost_m": {
+            "anyOf": [_METRES, {"type": "null"}],
+            "description": "the same by the calibrated one; null where there is none",
+        },
     },
     "required": [
-        *(
-            "laser",
-            "id",
-            "place",
-            "begin",
-            "end",
-            "heading_deg",
-            "speed_mps",
-            "nearest_m",
-            "returns",
-            "slices",
-        ),
-        *("measured_cost_m", "cost_m"),
+        *("name", "laser", "id", "place", "use", "begin", "end", "heading_deg", "speed_mps", "direction"),
+        *("nearest_m", "returns", "slices", "measured_cost_m", "calibrated_cost_m"),
     ],
 }
+"""What else PASSES tells of a pass is in it, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +180,7 @@ class Decoder:
         self._now_ns = self._pose_ns = 0
         self._first_ns: int | None = None
         self._clock_ns: int | None = None
+        self._before: dict[str, int] = {}
         self._kept: list[tuple[str, StoredPass]] = []  # without their returns, which are in the file
         self._returns: IO[bytes] = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - until closed
 
@@ -201,7 +198,11 @@ class Decoder:
         self._now_ns = item.t_ns
         if self._first_ns is None:
             self._first_ns = item.t_ns
-        play(self._pipeline, item)
+        if isinstance(item, Event) and "past" in item.content:  # another day: its passes are numbered on
+            told = item.content["past"]["passes"]
+            self._before = {name: max(numbers, default=0) for name, numbers in told.items()}
+        with suppress(Refused):  # of an earlier day's pass
+            play(self._pipeline, item)
         if self._clock_ns is None or item.t_ns - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = item.t_ns
             gps_ns = self._pipeline.gps_ns(item.t_ns)
@@ -233,8 +234,9 @@ class Decoder:
                 self._channels.put("/tf", first_ns, foxglove.sensor_on_body(stamp_ns, f"{name}/{how}", mount))
             self._channels.put("/tf", first_ns, foxglove.same_frame(stamp_ns, f"{name}/{how}", name))
         self._returns.seek(0)
+        rows = {(row["laser"], row["pass"]): row for row in self._pipeline.passes()}
         for name, stored in self._kept:
-            self._write_pass(name, stored, found[name])
+            self._write_pass(name, stored, rows[name, stored.id], found[name])
         self._writer.add_metadata(METADATA, about)
 
     def _calibration(self) -> tuple[str, dict[str, dict[str, Any]]]:
@@ -273,39 +275,34 @@ class Decoder:
         gps_ns = stored.gps_ns[[stored.gps_ns.argmin(), stored.gps_ns.argmax()]]
         self._kept.append((laser, replace(stored, returns=stored.returns[:0], gps_ns=gps_ns)))
 
-    def _write_pass(self, laser: str, stored: StoredPass, found: _Calibrated | None) -> None:
+    def _write_pass(
+        self, laser: str, stored: StoredPass, row: dict[str, Any], found: _Calibrated | None
+    ) -> None:
         returns = _returns(np.load(self._returns), stored.id)
         measured = Mount(**self._lasers[laser].mount.model_dump())
         radius_m = self._config.pole.radius_m
         begin_ns, end_ns = (foxglove.utc_ns(int(gps_ns)) for gps_ns in stored.gps_ns)
         t_ns = stored.t_ns[1]
-        topic = f"/{laser}/points"
-        cloud = foxglove.point_cloud(end_ns, points_nav(returns, measured), returns.kind)
-        self._channels.put(f"{topic}/measured", t_ns, cloud)
+        number = stored.id + self._before.get(laser, 0)
+        shown = {"measured": (returns, measured)}
         cost_m = None
         if found is not None:
             shifted = found.apply(returns)
-            cloud = foxglove.point_cloud(end_ns, points_nav(shifted, found.mount), returns.kind)
-            self._channels.put(f"{topic}/calibrated", t_ns, cloud)
+            shown["calibrated"] = shifted, found.mount
             cost_m = cost(shifted, found.mount, radius_m)
+        if row["use"] != OTHER:
+            for how, (each, mount) in shown.items():
+                cloud = foxglove.point_cloud(end_ns, points_nav(each, mount), each.kind)
+                self._channels.put(f"/{laser}/points/{how}", t_ns, cloud)
         pole = returns.kind == Kind.POLE
-        assert returns.velocity_mps is not None
-        yaw_rad = returns.rpy_rad[:, 2]
-        ahead_mps = (returns.velocity_mps * rotation(returns.rpy_rad)[:, :, 0]).sum(axis=1)
-        heading_deg = np.degrees(np.arctan2(np.sin(yaw_rad).mean(), np.cos(yaw_rad).mean()))
-        content = {
-            "laser": laser,
-            "id": stored.id,
-            "place": stored.place,
+        content = {key: value for key, value in row.items() if key not in ("pass", "gps_ns", "t_ns")} | {
+            "name": name_of(laser, number),
+            "id": number,
             "begin": _time(begin_ns),
             "end": _time(end_ns),
-            "heading_deg": float(heading_deg % 360),
-            "speed_mps": float(ahead_mps.mean()),
-            "nearest_m": float(returns.range_m[pole].min()),
             "returns": {"pole": int(pole.sum()), "ground": int((~pole).sum())},
-            "slices": {str(part): count for part, count in sorted(stored.moments.pole_returns.items())},
             "measured_cost_m": cost(returns, measured, radius_m),
-            "cost_m": cost_m,
+            "calibrated_cost_m": cost_m,
         }
         self._channels.put_json("/pole_pass", t_ns, POLE_PASS, content)
 

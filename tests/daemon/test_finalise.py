@@ -78,11 +78,11 @@ def test_a_daemon_finalises_at_its_start_and_when_a_session_ends(bench, running,
 
     crashed = session(bench.folder / "state", "20261122T000000Z-crashed", close=False)
     with running(bench), Client(bench.config.socket, 60.0) as client:
-        until(lambda: is_indexed(crashed))
+        until(lambda: is_indexed(crashed), 60.0)
         assert client.request({"class": "START", "name": "yard"})["class"] == "STARTED"
         client.request({"class": "STOP"})
         log = bench.folder / "polecald.log"
-        until(lambda: "capture repaired" in log.read_text() and "capture indexed" in log.read_text())
+        until(lambda: "capture repaired" in log.read_text() and "capture indexed" in log.read_text(), 60.0)
     assert len(bench.sessions) == 2
     assert all(is_indexed(folder / "capture.mcap") for folder in bench.sessions)
 
