@@ -202,7 +202,10 @@ def _port(place: _Place, system: System, stop: threading.Event) -> list[Check]:
     except DeviceNotPermitted as error:
         return [fault(name, str(error), who_may(place.path), Code.NOT_PERMITTED)]
     except DeviceBusy as error:
-        hint = f"`sudo fuser -v {place.path}` names it; ModemManager and brltty are the usual ones"
+        hint = f"`sudo fuser -v {place.path}` names it"
+        for program, remedy in _GRABBERS.items():
+            if system.running(program):
+                hint += f"; {program} runs, and may be it: {remedy}"
         return [fault(name, str(error), hint, Code.BUSY)]
     except DeviceError as error:
         return [fault(name, str(error), error.hint, code_of(error))]

@@ -156,6 +156,13 @@ def site(tmp_path, make_laser, make_receiver, parked):
     return Site()
 
 
+@pytest.fixture
+def few_rates(monkeypatch):
+    """Fewer rates to try, as in real time each takes its while; tests of the probes try them all."""
+    monkeypatch.setattr(doctor, "_LMS_RATES", (500000, 9600))
+    monkeypatch.setattr(doctor, "SPAN_RATES", (230400, 9600))
+
+
 def assert_only(checks, name, state, *words, code):
     """One check is not well, it says these words and what to do, and the exit code is its."""
     bad = {check.name: check for check in checks.values() if check.state in ("warn", "fault")}
@@ -244,10 +251,19 @@ def test_a_port_that_another_program_holds_names_it_and_how_to_be_rid_of_it(site
     assert_only(checks, "front port", "fault", f"{program} (pid {process.pid})", hint, code=75)
 
 
-def test_a_port_that_is_locked_by_who_cannot_be_seen_is_told(site):
-    with site.with_devices(), Port(str(site.lms), 9600):
-        checks = site.examine()  # its own process is not looked for
-    assert_only(checks, "front port", "fault", "another program holds it", "fuser", code=75)
+def test_a_port_that_is_locked_by_who_cannot_be_seen_names_who_may_be_it(site, tmp_path):
+    suspect = tmp_path / "ModemManager"
+    suspect.symlink_to(sys.executable)
+    with (
+        site.with_devices(),
+        Port(str(site.lms), 9600),  # its own process is not looked for
+        subprocess.Popen([suspect, "-S", "-c", "input()"], stdin=subprocess.PIPE) as process,
+    ):
+        checks = site.examine()
+        process.communicate(b"\n")
+    assert_only(
+        checks, "front port", "fault", "another program holds it", "fuser", "ModemManager runs", code=75
+    )
 
 
 def test_a_port_that_is_not_there_says_which_are(site, tmp_path):
@@ -302,6 +318,7 @@ def test_an_adapter_that_cannot_do_the_rate_is_told(site):
     ],
     ids=["silence", "echo", "noise", "deaf"],
 )
+@pytest.mark.usefixtures("few_rates")
 def test_what_wires_do_to_a_laser_is_told_apart(site, make_laser, wires, says):
     laser = make_laser()
     laser.force_stream(time.monotonic_ns())
@@ -318,12 +335,14 @@ def test_what_wires_do_to_a_laser_is_told_apart(site, make_laser, wires, says):
     ],
     ids=["silence", "echo", "noise", "deaf"],
 )
+@pytest.mark.usefixtures("few_rates")
 def test_what_wires_do_to_a_receiver_is_told_apart(site, make_receiver, wires, says):
     receiver = make_receiver()
     receiver.force_logs(time.monotonic_ns(), [("INSPVASB", 0.02)])
     assert_only(site.checks(receiver=wires(receiver)), "span line", "fault", *says, code=4)
 
 
+@pytest.mark.usefixtures("few_rates")
 def test_exchanged_plugs_are_told_at_both_ports(site, make_laser, make_receiver):
     checks = site.checks(make_receiver(), make_laser())
     for name, what in (("front line", "a NovAtel receiver"), ("span line", "a laser")):
