@@ -1,13 +1,24 @@
 """What is sent to a terminal draws the status, whatever it showed before, in few bytes."""
 
+import contextlib
 import copy
+import fcntl
 import io
+import os
 import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
 
 import pytest
+import structlog
 from rich.color import ColorSystem
 
 from polecal.daemon import screen
+from polecal.daemon.control import ControlServer
 from polecal.daemon.watch import Painter, Terminal, Watch
 
 LINE_BYTES_S = 960  # of 9600 bit/s
@@ -176,3 +187,57 @@ def test_a_terminal_is_given_back_also_after_an_error():
     said = stream.getvalue()
     assert said.startswith("\x1b[?1049h\x1b[?25l")
     assert said.endswith("\x1b[?25h\x1b[?1049l")
+
+
+@pytest.mark.parametrize(("term", "redraws"), [("vt100", True), ("xterm-256color", True), ("dumb", False)])
+def test_a_real_terminal_shows_the_status_until_ctrl_c(term, redraws, tmp_path):
+    """The command itself, on a pseudo-terminal, with a daemon that counts frames."""
+    structlog.configure(logger_factory=structlog.WriteLoggerFactory(io.StringIO()))
+    asked = []
+
+    class Counting:
+        def handle(self, request):
+            asked.append(request)
+            return {"class": "STATUS"} | later(len(asked))
+
+    master, slave = os.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("4H", 24, 80, 0, 0))
+    environment = os.environ | {"TERM": term, "LANG": "C.UTF-8", "LC_ALL": "C.UTF-8"}
+    command = [
+        sys.executable,
+        "-m",
+        "polecal.daemon.field",
+        "--socket",
+        tmp_path / "sock",
+        "status",
+        "--watch",
+    ]
+    said = b""
+    with (
+        ControlServer(tmp_path / "sock", Counting(), watch_s=0.05),
+        subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave, env=environment) as process,
+    ):
+        os.close(slave)
+        while len(asked) < 20:
+            assert select.select([master], [], [], 20)[0], said
+            said += os.read(master, 65536)
+        process.send_signal(signal.SIGINT)
+        with contextlib.suppress(OSError):  # EIO once it has gone
+            while data := os.read(master, 65536):
+                said += data
+        assert process.wait(20) == 0
+    os.close(master)
+    structlog.reset_defaults()
+    text = said.decode()
+    assert ("\x1b[?1049h" in text) == redraws
+    if redraws:
+        shown, _, left = text.partition("\x1b[?25h\x1b[?1049l")
+        vt = Vt()
+        vt.take(shown)
+        assert any("next: drive past the pole heading" in line for line in vt.lines)
+        assert "next: drive past the pole heading" in left  # the last state stays to be read
+        assert shown.count("polecal") == 1  # drawn whole only once
+    else:
+        assert "\x1b" not in text
+        assert text.count("next: drive past") > 5
+    assert text.isascii() == (term == "vt100")
