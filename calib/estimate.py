@@ -33,6 +33,7 @@ _MOST_SET_ASIDE = 0.25  # of all passes: where more disagree, it is not they tha
 _LEAST_M = 0.02  # of √c: what few passes fit better than their returns are is fitted too well
 _FARTHEST = 20.0  # σ of the hand measurement: beyond, there is no such mount
 _ODD, _ODD_M = 6.0, 0.06  # times the passes' median, and at least so far
+_PAPER = (np.inf, np.inf)  # `Scatter.form`'s ratios of pole and ground: Eq. 7 to the letter
 _TELLING = (10e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
 """What an extra may be where the data know it no better: the latency of a serial adapter; 5 mm; 5 mm on a
 metre; 2 cm on ten."""
@@ -66,6 +67,8 @@ class Setup:
     pole_radius_m: float = 0.0
     pass_error: bool = True
     """Whether each pass may have a navigation error of its own, which weighs it down; else Eq. 7 as it is."""
+    rough_ground: bool = True
+    """Whether the bias that rough ground has in Eq. 6 is taken off (`solve.Form.rough_m2`)."""
     extras: frozenset[str] = frozenset(EXTRAS)
     """What of `solve.EXTRAS` to solve for, too, as far as the data can tell it."""
     hold: frozenset[str] = frozenset()
@@ -149,6 +152,7 @@ def calibrate(
     pole_radius_m: float = 0.0,
     *,
     pass_error: bool = False,
+    rough_ground: bool = False,
     extras: Collection[str] = (),
     measured_sigma: Mount = MEASURED_SIGMA,
     hold: Collection[str] = (),
@@ -167,6 +171,8 @@ def calibrate(
         0 is the paper's cost to the letter; else pole returns are moved to the pole's axis.
     pass_error
         Let each pass have a navigation error of its own: not the paper's cost, and nearer to the truth.
+    rough_ground
+        Take off what bumps of the ground add to the cost: not the paper's, and nearer to the truth.
     extras
         Names of `solve.EXTRAS` to solve for, too; a time offset needs the returns' motion.
     measured_sigma
@@ -189,6 +195,7 @@ def calibrate(
         measured_sigma=measured_sigma,
         pole_radius_m=pole_radius_m,
         pass_error=pass_error,
+        rough_ground=rough_ground,
         extras=frozenset(extras) - (set() if returns.motion is not None else {"time_s"}),
         hold=frozenset(hold),
         criteria=criteria or Criteria(),
@@ -243,6 +250,16 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
     return problem.result(used, found, set_aside)
 
 
+def scatter_of(
+    totals: Sequence[Moments], kind: Kind, pole_radius_m: float, sites: Sequence[int] | None = None
+) -> Scatter:
+    """Give the scatter of passes' returns of one kind; those of the pole at its axis, even over its width."""
+    if kind is Kind.GROUND:
+        return Scatter(totals, sites=sites)
+    across_m = pole_radius_m / np.sqrt(3.0)
+    return Scatter(totals, shift_m=axis_shift_m(pole_radius_m), ranged=True, across_m=across_m, sites=sites)
+
+
 @dataclass(frozen=True, slots=True)
 class _Found:
     """A minimum: the unknowns (12,), their covariance (12, 12), and which were held."""
@@ -251,6 +268,7 @@ class _Found:
     covariance: Array
     held: frozenset[str]
     ratios: tuple[float, float]
+    rough_m2: float
     left_out: Array | None
     """(P, 12) without each used pass, or None where there are too few."""
 
@@ -260,13 +278,9 @@ class _Problem:
 
     def __init__(self, passes: Sequence[Pass], setup: Setup) -> None:
         sites = [one.site for one in passes]
-        self.pole = Scatter(
-            [one.total(Kind.POLE) for one in passes],
-            shift_m=axis_shift_m(setup.pole_radius_m),
-            ranged=True,
-            sites=sites,
+        self.pole, self.ground = (
+            scatter_of([one.total(kind) for one in passes], kind, setup.pole_radius_m, sites) for kind in Kind
         )
-        self.ground = Scatter([one.total(Kind.GROUND) for one in passes], sites=sites)
         self._passes, self._setup = passes, setup
         self._measured = np.concatenate([setup.measured.vector, np.zeros(len(EXTRAS))])
         self._measured_sigma = np.concatenate([setup.measured_sigma.vector, _TELLING])
@@ -277,15 +291,17 @@ class _Problem:
         numbers = np.flatnonzero(used)
         enough = len(numbers) >= FEWEST_PASSES
         held = {*setup.hold, *EXTRAS} - (setup.extras if enough else set())
-        ratios = (np.inf, np.inf)
-        if setup.pass_error and enough:
-            rough = solve.minimise(self._form(used, ratios), measured, held)
-            ratios = (
-                self.pole.ratio(pole_rows(rough), used),
-                self.ground.ratio(ground_rows(rough), used),
-            )
-        whole = self._form(used, ratios)
-        without = [self._form(_but(used, number), ratios) for number in numbers.tolist()] if enough else []
+        ratios, rough_m2 = _PAPER, 0.0
+        if (setup.pass_error or setup.rough_ground) and enough:  # both are fixed from here on
+            about = solve.minimise(self._form(used, ratios), measured, held)
+            if setup.pass_error:
+                ratios = self.pole.ratio(pole_rows(about), used), self.ground.ratio(ground_rows(about), used)
+            if setup.rough_ground:
+                rough_m2 = self.ground.mean_within(ground_rows(about), used)
+        whole = self._form(used, ratios, rough_m2)
+        without = (
+            [self._form(_but(used, one), ratios, rough_m2) for one in numbers.tolist()] if enough else []
+        )
         # What the data know no better than the tape measure is not taken from them. On a flat pad z is
         # nearly free (paper.md, later work 4) and more passes hardly help: it meets its bound, or is held.
         believable = self._measured_sigma.copy()
@@ -295,7 +311,7 @@ class _Problem:
         while True:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
-            squared = max(whole.cost(vector), _LEAST_M**2)
+            squared = max(whole.spread(vector), _LEAST_M**2)
             left_out = None
             if enough:
                 left_out = np.stack([solve.minimise(part, vector, held) for part in without])
@@ -316,7 +332,7 @@ class _Problem:
                 doubt = np.maximum(doubt, far * free)
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
-                return _Found(vector, covariance, frozenset(held), ratios, left_out)
+                return _Found(vector, covariance, frozenset(held), ratios, rough_m2, left_out)
             held.add(UNKNOWNS[worst])
 
     def oddest(self, used: NDArray[np.bool_], vector: Array) -> tuple[int, str] | None:
@@ -346,7 +362,7 @@ class _Problem:
     def result(self, used: NDArray[np.bool_], found: _Found, set_aside: dict[int, str]) -> Result:
         """Say what was found, and judge it."""
         setup, vector, held = self._setup, found.vector, found.held
-        paper = self._form(used, (np.inf, np.inf))  # Eq. 7
+        paper = self._form(used)  # Eq. 7
         passes = [one for one, is_used in zip(self._passes, used, strict=True) if is_used]
         mask = _mask(held)[:6]
         covariance = found.covariance[:6, :6] + self._not_told(used, found)
@@ -415,7 +431,7 @@ class _Problem:
         """Find the minimum of some passes, what is held and how they weigh as in ``found``."""
         some = np.zeros(len(self._passes), dtype=bool)
         some[list(numbers)] = True
-        return solve.minimise(self._form(some, found.ratios), found.vector, found.held)
+        return solve.minimise(self._form(some, found.ratios, found.rough_m2), found.vector, found.held)
 
     def _not_told(self, used: NDArray[np.bool_], found: _Found) -> Array:
         """Give what the extras that should be solved for and cannot add to the covariance (6, 6).
@@ -433,8 +449,11 @@ class _Problem:
         added: Array = moved[:6] @ moved[:6].T
         return added
 
-    def _form(self, used: NDArray[np.bool_], ratios: tuple[float, float]) -> Form:
-        return Form(self.pole.form(used, ratios[0]), self.ground.form(used, ratios[1]))
+    def _form(
+        self, used: NDArray[np.bool_], ratios: tuple[float, float] = _PAPER, rough_m2: float = 0.0
+    ) -> Form:
+        pole, ground = self.pole.form(used, ratios[0]), self.ground.form(used, ratios[1])
+        return Form(pole, ground, rough_m2, self.ground.ray(used) if rough_m2 else None)
 
 
 def _but(used: NDArray[np.bool_], *numbers: int) -> NDArray[np.bool_]:

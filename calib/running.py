@@ -13,22 +13,23 @@ import numpy as np
 
 from polecal.calib import moments, solve
 from polecal.calib.blas import one_thread
-from polecal.calib.estimate import Pass, Result, Setup, sum_of
+from polecal.calib.estimate import Pass, Result, Setup, scatter_of, sum_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
-from polecal.calib.observations import Kind, Mount, Returns, axis_shift_m
+from polecal.calib.observations import Kind, Mount, Returns
 from polecal.calib.solve import EXTRAS, Form, Scatter, ground_rows, pole_rows
 from polecal.calib.uncertainty import FEWEST_PASSES
 
 
 @dataclass(frozen=True, slots=True)
 class _Closed:
-    """Closed passes of one kind: returns, `Scatter.form` times them; weight and mean (108,) of one site."""
+    """Closed passes of one kind: returns, `Scatter.form` and `ray` times them; one site's weight and mean."""
 
     count: float
     weight: float
     mean: Array
     summed: Array
+    ray: Array
     ratio: float
 
     @classmethod
@@ -39,6 +40,7 @@ class _Closed:
             count,
             *scatter.weighted_mean(used & (scatter.sites == site), ratio),
             count * scatter.form(used, ratio),
+            count * scatter.ray(used),
             ratio,
         )
 
@@ -64,19 +66,21 @@ class Running:
         self._held = {*result.held, *EXTRAS} - set(result.extras)
         extras = [result.extras.get(name, 0.0) for name in EXTRAS]
         self._vector = np.concatenate([result.mount.vector, extras])
-        self._shift_m = axis_shift_m(setup.pole_radius_m)
+        self._radius_m = setup.pole_radius_m
         self._open = {kind: moments.zero() for kind in Kind}
         self._closed: dict[Kind, _Closed] = {}
         for kind, rows in ((Kind.POLE, pole_rows(self._vector)), (Kind.GROUND, ground_rows(self._vector))):
             scatter = self._scatter([one.total(kind) for one in used], kind, [one.site for one in used])
-            weighed = setup.pass_error and len(used) >= FEWEST_PASSES
-            ratio = scatter.ratio(rows, scatter.count > 0) if weighed else np.inf
+            enough, seen = len(used) >= FEWEST_PASSES, scatter.count > 0
+            ratio = scatter.ratio(rows, seen) if setup.pass_error and enough else np.inf
+            self._rough_m2 = scatter.mean_within(rows, seen) if setup.rough_ground and enough else 0.0
             self._closed[kind] = _Closed.of(scatter, ratio, used[-1].site)
 
     @one_thread
     def add(self, returns: Returns) -> Mount:
         """Add returns of the open pass, and solve again."""
-        forms = []
+        forms: dict[Kind, Array] = {}
+        ray = self._closed[Kind.GROUND].ray
         for kind, closed in self._closed.items():
             of_kind = np.flatnonzero(returns.kind == kind)
             blocks = moments.by_group(
@@ -88,12 +92,15 @@ class Running:
             )
             self._open[kind] = sum_of([self._open[kind], *blocks.values()])
             scatter, one = self._scatter([self._open[kind]], kind), np.array([True])
-            forms.append(closed.form(scatter.count[0], scatter.weighted_mean(one)[1], scatter.form(one)))
-        self._vector = solve.minimise(Form(*forms), self._vector, self._held)
+            within = scatter.form(one, closed.ratio)
+            forms[kind] = closed.form(scatter.count[0], scatter.weighted_mean(one)[1], within)
+            if kind is Kind.GROUND:
+                ray = (ray + scatter.count[0] * scatter.ray(one)) / max(1.0, closed.count + scatter.count[0])
+        form = Form(forms[Kind.POLE], forms[Kind.GROUND], self._rough_m2, ray if self._rough_m2 else None)
+        self._vector = solve.minimise(form, self._vector, self._held)
         return Mount.from_vector(self._vector[:6])
 
     def _scatter(
         self, of_passes: Sequence[Moments], kind: Kind, sites: Sequence[int] | None = None
     ) -> Scatter:
-        pole = kind is Kind.POLE
-        return Scatter(of_passes, shift_m=self._shift_m if pole else 0.0, ranged=pole, sites=sites)
+        return scatter_of(of_passes, kind, self._radius_m, sites)

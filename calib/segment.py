@@ -44,9 +44,10 @@ class Reflector:
 def reflectors(
     range_m: Array, bearing_rad: Array, reflectivity: Array, *, pole_radius_m: float
 ) -> list[Reflector]:
-    """Find the retro-reflective objects in a scan.
+    """Find the retro-reflective objects in a scan that are seen from edge to edge.
 
-    Takes (N,) arrays in the order of the beams, NaN where there is no range.
+    Takes (N,) arrays in the order of the beams, NaN where there is no range. What the first or the last beam
+    meets may go on beyond: the part that is seen of a pole is not where the whole pole is.
     """
     bright = np.flatnonzero((reflectivity >= RETRO_REFLECTIVE) & np.isfinite(range_m))
     if not len(bright):
@@ -55,6 +56,8 @@ def reflectors(
     step_rad = abs(float(bearing_rad[1] - bearing_rad[0]))
     found = []
     for together in np.split(bright, np.flatnonzero(apart) + 1):
+        if together[0] == 0 or together[-1] == len(range_m) - 1:
+            continue
         beams = together
         distance_m = float(range_m[beams].mean())
         width_m = distance_m * (abs(float(bearing_rad[beams[-1]] - bearing_rad[beams[0]])) + step_rad)

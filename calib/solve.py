@@ -2,7 +2,8 @@
 
 All of Eq. 7 is quadratic in h⁺ (`moments`), so that a solution costs the same for a hundred returns and for
 a million. Beside the six of the mount it can be solved for what else shifts the cloud: a time offset between
-laser and navigation, a range offset of the reflector, a pole that leans, ground that slopes.
+laser and navigation, a range offset of the reflector, a pole that leans, ground that slopes. And what rough
+ground adds to Eq. 6, the more the beams graze it, can be taken off.
 """
 
 from __future__ import annotations
@@ -28,14 +29,21 @@ _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
 _CLEARLY = 0.995  # of √c: on flat ground the mirror image is as good, but for the noise
 _NOTHING = 1e-15
 _DESCENTS = 40
+_LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
+
+
+_RAY = np.zeros(WIDTH, dtype=bool)  # what a range scales in h⁺: a beam's way from the sensor to its return
+_RAY[[*range(0, 6), *range(RANGE.start, RANGE.stop)]] = True
+_RAY[[*range(TIME.start, TIME.start + 6), *range(TIME_SQUARED.start, TIME_SQUARED.start + 6)]] = True
 
 
 class Scatter:
     """The spread of one kind of returns: within each pass, and of the passes' means about their site's.
 
     Takes each pass's moments. ``shift_m`` is a range offset that is known; ``ranged`` says whether these
-    returns take part in one that is not. ``sites`` has a number a pass: of another day, where the pole and
-    the ground are not where they were; else all are of one.
+    returns take part in one that is not. ``across_m`` is how far to the side of their mark they are, σ.
+    ``sites`` has a number a pass: of another day, where the pole and the ground are not where they were;
+    else all are of one.
     """
 
     def __init__(
@@ -44,6 +52,7 @@ class Scatter:
         *,
         shift_m: float = 0.0,
         ranged: bool = False,
+        across_m: float = 0.0,
         sites: Sequence[int] | None = None,
     ) -> None:
         self.count = np.array([one.count for one in passes], dtype=np.float64)
@@ -53,6 +62,7 @@ class Scatter:
         for features in (self._mean.reshape(-1, 3, WIDTH), three, three.swapaxes(2, 4)):  # views
             features[..., 0:6] += shift_m * features[..., RANGE]
             features[..., RANGE] *= ranged
+        self._aside = across_m**2 * np.stack([_aside(one) for one in passes]) if across_m else None
         self._all_within = self._within.sum(axis=0)
         self.sites = np.zeros(len(passes), dtype=np.int64) if sites is None else np.array(sites)
 
@@ -61,7 +71,9 @@ class Scatter:
 
         ``ratio`` is the variance within a pass over that of the error which all its returns share: a pass
         of n returns says no more of where its mean should be than n / (1 + n / ratio) independent ones.
-        Infinite: no error is shared, and the variances are those of Eqs. 5 and 6 to the letter.
+        Infinite: no error is shared, and the variances are those of Eqs. 5 and 6 to the letter. Else what is
+        seen within a pass counts for more, and there the returns to the side of a thick pole do harm
+        (`_aside`), which is taken off.
         """
         total = self.count[used].sum()
         if not total:
@@ -72,8 +84,16 @@ class Scatter:
             apart[site] -= weight[site] / (weight[site].sum() or 1.0) @ apart[site]
         few = used.sum() < len(used) / 2
         within = self._within[used].sum(axis=0) if few else self._all_within - self._within[~used].sum(axis=0)
+        if self._aside is not None and np.isfinite(ratio):
+            within = within - self._aside[used].sum(axis=0)
         form: Array = (within + (weight[:, None] * apart).T @ apart) / total
         return form
+
+    def ray(self, used: NDArray[np.bool_]) -> Array:
+        """Give the mean (108,) of the used passes' features, all but those of the beams' way left out."""
+        mean: Array = self.count[used] @ self._mean[used] / max(1.0, self.count[used].sum())
+        ray: Array = mean * np.tile(_RAY, 3)
+        return ray
 
     def weighted_mean(self, used: NDArray[np.bool_], ratio: float = np.inf) -> tuple[float, Array]:
         """Give what the used passes weigh together, and their mean (108,) so weighed."""
@@ -111,6 +131,11 @@ class Scatter:
         within: Array = np.maximum(0.0, summed) / np.maximum(1.0, self.count) / len(rows)
         return within
 
+    def mean_within(self, rows: Array, used: NDArray[np.bool_]) -> float:
+        """Give `within` of the used passes together, each counted by its returns, m²."""
+        count = self.count[used]
+        return float(count @ self.within(rows)[used] / max(1.0, count.sum()))
+
     def ratio(self, rows: Array, used: NDArray[np.bool_]) -> float:
         """Estimate `form`'s ratio from the used passes themselves."""
         there = used & (self.count > 0)
@@ -119,7 +144,7 @@ class Scatter:
         free = len(count) - len(sites)
         if free < 1:
             return np.inf
-        within = float((count * self.within(rows)[there]).sum() / count.sum())
+        within = self.mean_within(rows, used)
         spread = np.zeros(len(rows))
         for site in sites:
             if (more := int(site.sum()) - 1) > 0:
@@ -140,18 +165,60 @@ def _each(sites: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
     return [sites == site for site in np.unique(sites)]
 
 
+def _aside(one: Moments) -> Array:
+    """Give what a return 1 m to the side of its mark adds to Σ f fᵀ, (108, 108), per m².
+
+    A return m to the side is at a bearing m / r off. A range offset b moves it along its own beam, not its
+    mark's, and so makes the spread (1 + b / r)² as wide: too short ranges look good. That it does is no
+    news of b. 1 / r on average is told by the means of r and r², as if ln r were normal.
+    """
+    added = np.zeros((3, WIDTH, 3, WIDTH))
+    second = one.second.reshape(3, WIDTH, 3, WIDTH) / max(1, one.count)
+    ranged = second[:, RANGE][:, :, :, RANGE].reshape(3, 2, 3, 3, 2, 3)  # of [cos θ C | sin θ C]
+    across = one.count * ranged[:, ::-1][:, :, :, :, ::-1]  # of [-sin θ C | cos θ C], but for signs
+    across[:, 0, :, :, 1] *= -1.0
+    across[:, 1, :, :, 0] *= -1.0
+    # Each of the three axes of C is of length 1.
+    r_m = float(np.einsum("aiai", second[:, :6, :, RANGE])) / 3
+    r_m2 = float(np.einsum("aiai", second[:, :6, :, :6])) / 3
+    per_m = r_m2 / r_m**3 if r_m > 0 else 0.0
+    both = per_m * across.reshape(3, 6, 3, 6)
+    added[:, :6, :, RANGE] = both
+    added[:, RANGE, :, :6] = both
+    return added.reshape(3 * WIDTH, 3 * WIDTH)
+
+
 @dataclass(frozen=True, slots=True)
 class Form:
     """Eq. 7 as a function of the unknowns: the covariances of both kinds' features, (108, 108) each."""
 
     pole: Array
     ground: Array
+    rough_m2: float = 0.0
+    """Variance of the ground's own heights and of the ranges to it, down; 0 is Eq. 7 to the letter.
 
-    def cost(self, vector: Array) -> float:
-        """Give c in m² at ``vector`` (12,)."""
+    A beam meets a bump the nearer, the more it grazes: an error e of height shifts the return along the beam,
+    by e / d for a beam that goes down by d a metre. What Eq. 6 takes for its derivative holds e twice, and so
+    is wrong by σ² ∂ ln d on average, that is, rough ground looks flattest to a mount that sees it less
+    steeply than the true one. In words of likelihood: the density of what is measured, the range, is that of
+    the height times d, and Eq. 6 leaves out the factor. As d is the sensor's height over the ground by the
+    range, the missing term is -2 σ² ln of that height but for what no mount changes.
+    """
+    ray: Array | None = None
+    """(108,) `Scatter.ray` of the ground, where it is rough."""
+
+    def spread(self, vector: Array) -> float:
+        """Give the quadratic part of c in m² at ``vector`` (12,), the variances of Eq. 7."""
         h = _h(vector)
         pole, ground = _rows(_pole_weights(vector)[0], h), _rows(_ground_weights(vector)[0], h)
-        return max(0.0, float((pole @ self.pole * pole).sum() + (ground @ self.ground * ground).sum()))
+        return float((pole @ self.pole * pole).sum() + (ground @ self.ground * ground).sum())
+
+    def cost(self, vector: Array) -> float:
+        """Give what is minimised, c in m² at ``vector`` (12,); on rough ground it may be negative."""
+        if self.ray is None:
+            return self.spread(vector)
+        height_m = float(abs(ground_rows(vector)[0] @ self.ray))
+        return self.spread(vector) - 2.0 * self.rough_m2 * float(np.log(max(height_m, _LEAST_HEIGHT_M)))
 
     def slope(self, vector: Array) -> tuple[Array, Array]:
         """Give half the gradient (12,) and half the Gauss-Newton Hessian (12, 12) of c."""
@@ -164,12 +231,15 @@ class Form:
                 pulled = matrix @ jacobian
                 gradient += pulled.T @ np.outer(weight, h).ravel()
                 hessian += jacobian.T @ pulled
+        if self.ray is not None:  # the ground's jacobian came last
+            height_m = np.outer(weight, h).ravel() @ self.ray
+            gradient -= self.rough_m2 / height_m * (self.ray @ jacobian)
         return gradient, hessian
 
 
 def cost_m(form: Form, vector: Array) -> float:
-    """Give √c in m at ``vector`` (12,)."""
-    return float(np.sqrt(form.cost(vector)))
+    """Give √c of Eq. 7 in m at ``vector`` (12,)."""
+    return float(np.sqrt(max(0.0, form.spread(vector))))
 
 
 def pole_rows(vector: Array) -> Array:
@@ -203,7 +273,7 @@ def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:
         while damping < _GIVE_UP:
             step = np.zeros(len(UNKNOWNS))
             step[free] = -np.linalg.lstsq(_damped(hessian, damping), gradient, rcond=1e-15)[0]
-            if -gradient @ step[free] <= _NOTHING * cost:  # what the step promises
+            if -gradient @ step[free] <= _NOTHING * abs(cost):  # what the step promises
                 return vector
             lower = form.cost(vector + step)
             if lower < cost:

@@ -180,7 +180,7 @@ def _axial(matrix: Array) -> Array:
 
 
 def _pole(rig: Rig, scans: _Scans) -> tuple[NDArray[np.int64], Array, Array]:
-    """Give scan, bearing and true range of every beam that meets the pole."""
+    """Give scan, bearing and true range of every beam that meets the pole, where all of it is in view."""
     origin, columns = scans.sees(rig.mount)
     to_axis = -origin[:, :2]
     ahead, right = (_cross(columns[:, :2, axis], to_axis) for axis in range(2))
@@ -202,7 +202,10 @@ def _pole(rig: Rig, scans: _Scans) -> tuple[NDArray[np.int64], Array, Array]:
     range_m = (closest - chord) / flat
     up = -(origin[scan, 2] + range_m * ray[:, 2])
     hit = np.abs(miss) < rig.pole_radius_m
-    hit &= (range_m > 0) & (np.abs(bearing) <= half + 1e-9) & (up > 0) & (up < rig.pole_height_m)
+    hit &= (range_m > 0) & (up > 0) & (up < rig.pole_height_m)
+    cut = np.zeros(len(origin), dtype=bool)  # half a pole is not seen where the whole one is
+    cut[scan[hit & (np.abs(bearing) >= half - 1e-9)]] = True
+    hit &= ~cut[scan]
     return scan[hit], bearing[hit], range_m[hit]
 
 

@@ -12,7 +12,7 @@ from polecal.calib.running import Running
 def test_scan_by_scan_the_estimate_comes_to_that_of_all_passes(rig, extras):
     """To Eq. 7 of all of them; it is where the estimate without the last pass is not."""
     returns = rig.drive(noise_m=0.01, nav_m=0.02, passes=12, seed=3)
-    setup = Setup(rig.measured, pass_error=False, extras=extras)
+    setup = Setup(rig.measured, pass_error=False, rough_ground=False, extras=extras)
     last = returns.pass_id == 11
     before = estimate(passes_of(returns[~last], 30), setup)
     running = Running(passes_of(returns[~last], 30), setup, before)
