@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
 from polecal.calib.geometry import Array, wrap
 
@@ -26,6 +27,18 @@ def jackknife(left_out: Array) -> Array:
     spread -= spread.mean(axis=0)
     covariance: Array = (len(left_out) - 1) / len(left_out) * spread.T @ spread
     return covariance
+
+
+def reach(passes: int, unknowns: int = 1, level: float = 0.95) -> float:
+    """Give how many σ of `jackknife` the truth is within, with probability ``level``.
+
+    So few passes know their own scatter badly: of one unknown Student's t of P-1, of n together, whose
+    √(dᵀ C⁻¹ d) it bounds, Hotelling's T² (n at most P-1, else there is no such region, and it is infinite).
+    """
+    left = passes - unknowns
+    if left < 1:
+        return np.inf
+    return float(np.sqrt((passes - 1) * unknowns / left * fdtri(unknowns, left, level)))
 
 
 def from_model(information: Array, cost: float, observations: int, free: NDArray[np.bool_]) -> Array:

@@ -4,8 +4,22 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from polecal.calib import CalibrationError, Criteria, Kind, Mount, Need, Returns, calibrate, cost, points_nav
+from polecal.calib import (
+    CalibrationError,
+    Criteria,
+    Kind,
+    Mount,
+    Need,
+    Returns,
+    Setup,
+    calibrate,
+    cost,
+    estimate,
+    points_nav,
+)
+from polecal.calib.estimate import passes_of
 from polecal.calib.observations import PARAMETERS
+from polecal.calib.report.rig import Rig, drive
 
 
 def errors(found, true):
@@ -234,3 +248,70 @@ def test_what_else_shifts_the_cloud_is_found_and_leaves_the_mount_better(rig, na
     assert (errors(with_it.mount, rig.true) / [1, 1, 5, 57, 57, 57]).max() < max(
         0.01, (bad / [1, 1, 5, 57, 57, 57]).max()
     )
+
+
+SETUP = Setup(
+    Mount(0.0, -0.35, -1.0, 0.0, -8.0, 0.0),
+    pole_radius_m=0.04,
+    extras=frozenset(),
+    criteria=Criteria(max_sigma=(1.0,) * 6),  # so that z is not held
+)
+
+
+def errors_of_many_drives(rig, *setups, seeds=20, passes=12, **of_rig):
+    """The six unknowns' errors in drives with the same pole, but other ground, ways and noise: mm and °."""
+    drives = Rig(rig.true, passes=passes, speeds_mps=(1.5, 2.5, -1.0), **of_rig)
+    errors = []
+    for seed in range(seeds):
+        returns = drive(drives, np.random.default_rng(seed), 60 * passes, 120 * passes)
+        results = [estimate(passes_of(returns, 30), setup) for setup in setups]
+        errors.append([result.mount.vector - rig.true.vector for result in results])
+    return np.moveaxis(errors, 1, 0) * [1e3, 1e3, 1e3, *np.degrees([1, 1, 1])]
+
+
+def rms(errors):
+    return np.sqrt((errors**2).mean(axis=0))
+
+
+def test_rough_ground_is_seen_as_steeply_as_it_is_where_its_bias_is_taken_off(rig):
+    plain = replace(SETUP, rough_ground=False)
+    without, with_it = errors_of_many_drives(rig, plain, SETUP, rough_m=0.03)
+    pitch = PARAMETERS.index("pitch")
+    assert without[:, pitch].mean() > 0.025
+    assert abs(with_it[:, pitch].mean()) < 0.01
+    assert rms(with_it)[pitch] < 0.6 * rms(without)[pitch]
+    assert (rms(with_it) < 1.2 * rms(without)).all()
+
+
+def test_taking_rough_grounds_bias_off_changes_nothing_on_smooth_ground(rig):
+    plain = replace(SETUP, rough_ground=False)
+    without, with_it = errors_of_many_drives(rig, plain, SETUP, rough_m=0.0, seeds=8)
+    assert np.abs(with_it - without).max() < 0.1
+    assert np.abs(with_it - without)[:, 3:].max() < 0.001
+
+
+def test_passes_with_errors_of_their_own_are_weighed_down_to_the_good_of_all_unknowns(rig):
+    """Navigation off by 3 cm a pass: Eq. 7 as it is takes each pass for as many independent returns."""
+    as_eq7 = replace(SETUP, pass_error=False)
+    without, with_it = errors_of_many_drives(rig, as_eq7, SETUP, position_sigma_m=(0.03, 0.03, 0.03))
+    assert (rms(with_it) < rms(without)).all()
+    assert (rms(with_it)[2:] < 0.7 * rms(without)[2:]).all()
+
+
+def test_passes_without_errors_of_their_own_are_as_good_as_by_eq7(rig):
+    as_eq7 = replace(SETUP, pass_error=False)
+    exact = {"position_sigma_m": (0.0, 0.0, 0.0), "rpy_sigma_deg": (0.0, 0.0, 0.0)}
+    without, with_it = errors_of_many_drives(rig, as_eq7, SETUP, **exact)
+    assert (rms(with_it) < 1.2 * rms(without)).all()
+
+
+def test_a_thick_pole_does_not_look_nearer_where_passes_have_errors_of_their_own(rig):
+    """Its returns to the side lie off at a bearing, which a range offset would narrow."""
+    setup = replace(SETUP, pole_radius_m=0.06, extras=frozenset({"range_m"}))
+    drives = Rig(rig.true, passes=36, pole_radius_m=0.06, rough_m=0.0, speeds_mps=(1.5, 2.5, -1.0))
+    ranges_m = []
+    for seed in range(12):
+        returns = drive(drives, np.random.default_rng(seed), 3600, 1200)
+        result = estimate(passes_of(returns, 30), setup)
+        ranges_m.append(result.extras["range_m"])
+    assert np.mean(ranges_m) == pytest.approx(0.0, abs=0.0025)

@@ -71,6 +71,12 @@ def test_a_thick_poles_round_face_is_kept_whole():
     assert pole.beams.tolist() == list(range(100, 109))
 
 
+def test_what_the_field_of_view_cuts_off_is_not_seen_where_it_is():
+    assert found((0, 3, 4.0, 1.0)) == []
+    assert found((398, 3, 4.0, 1.0)) == []
+    assert len(found((1, 3, 4.0, 1.0), (397, 3, 4.0, 1.0))) == 2
+
+
 def test_sightings_go_to_the_nearest_place_or_make_one():
     places = Places()
     assert places.sight(np.array([3.0, 1.0]), 1.0, thin=True) == 0
