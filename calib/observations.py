@@ -184,6 +184,7 @@ def axis_shift_m(pole_radius_m: float) -> float:
     """How far behind its return a pole's axis lies, on average over the beams that hit it.
 
     A beam that passes the axis at distance d meets the pole √(ρ² - d²) in front of it; over d even in ±ρ
-    the mean is πρ/4.
+    the mean is πρ/4. That is a level beam's; one that goes down by 8° has 1 % more way to go, which at a pole
+    of 8 cm is 0.3 mm of range, and as it varies with the vehicle's tilt, 2 mm of z.
     """
     return np.pi / 4 * pole_radius_m

@@ -90,7 +90,7 @@ def a_scan_more(returns: Returns) -> Iterator[tuple[str | float, ...]]:
     driven, rng = returns[last], np.random.default_rng(0)
     scans = [driven[np.sort(rng.choice(len(driven), SCAN, replace=False))] for _ in range(20)]
     for way, setup in (
-        ("Eq. 7", Setup(paper.HAND, pass_error=False, extras=frozenset())),
+        ("Eq. 7", Setup(paper.HAND, pass_error=False, rough_ground=False, extras=frozenset())),
         ("all extras", Setup(paper.HAND, pole_radius_m=paper.RIG.pole_radius_m)),
     ):
         passes = passes_of(returns[~last], 30)

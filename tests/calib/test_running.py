@@ -1,10 +1,11 @@
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 
 from polecal.calib import Setup, estimate
 from polecal.calib.estimate import passes_of
+from polecal.calib.report.rig import Rig, drive
 from polecal.calib.running import Running
 
 
@@ -24,3 +25,17 @@ def test_scan_by_scan_the_estimate_comes_to_that_of_all_passes(rig, extras):
     assert (before.held, set(before.extras)) == (whole.held, set(whole.extras))
     assert astuple(current) == pytest.approx(astuple(whole.mount), abs=1e-6)
     assert abs(before.mount.x_m - whole.mount.x_m) > 1e-4
+
+
+def test_rough_ground_is_taken_off_scan_by_scan_too(rig):
+    """To what the closed passes say of how rough it is."""
+    rough = Rig(rig.true, passes=12, rough_m=0.03)
+    returns = drive(rough, np.random.default_rng(0), 1200, 4800)
+    setup = Setup(rig.measured, pass_error=False, extras=frozenset())
+    last = returns.pass_id == 11
+    before = estimate(passes_of(returns[~last], 30), setup)
+    current = Running(passes_of(returns[~last], 30), setup, before).add(returns[last])
+    whole = estimate(passes_of(returns, 30), setup)
+    plain = estimate(passes_of(returns, 30), replace(setup, rough_ground=False))
+    assert current.pitch_deg == pytest.approx(whole.mount.pitch_deg, abs=1e-3)
+    assert abs(plain.mount.pitch_deg - whole.mount.pitch_deg) > 1e-2

@@ -147,7 +147,7 @@ def test_a_gap_in_the_navigation_costs_the_beams_in_it_and_they_are_counted(begu
 
 
 def test_a_navigation_that_stays_away_is_waited_for_only_so_long(begun, settings, streaming):
-    chunks = streaming(world_of(straight(0.3), pole_ne_m=(7.0, 0.0)), 32.0)  # in view all the while
+    chunks = streaming(world_of(straight(0.3), pole_ne_m=(8.0, 0.0)), 32.0)  # in view all the while
     from_ns = chunks[0][1] + 12 * 10**9
     played = begun(settings()).feed(each for each in chunks if each[0] != "span" or each[1] < from_ns)
     assert played.state is State.ALIGNING
