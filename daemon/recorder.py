@@ -367,9 +367,12 @@ def _item(message: Message, channel: Channel) -> Record | Event | None:
     """Say what a message is, None for those that were not recorded but decoded. Raises _Cut."""
     if channel.topic == EVENTS:
         try:
-            return Event(message.log_time, json.loads(message.data))
+            content = json.loads(message.data)
         except ValueError as error:
             raise _Cut(f"is damaged ({error})") from error
+        if not isinstance(content, dict):
+            raise _Cut("is damaged (an event that is none)")
+        return Event(message.log_time, content)
     line = _line(channel.topic) if channel.message_encoding == RAW else None
     return None if line is None else Record(*line, message.log_time, message.data)
 

@@ -15,7 +15,7 @@ from polecal.daemon.choices import Choice
 from polecal.daemon.control import Refused
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Event, Record, RecorderError
-from polecal.daemon.routine import State
+from polecal.daemon.routine import RoutineError, State
 from polecal.daemon.sessions import CALIBRATION, Session, SessionError, captures_of
 
 BEGIN, FINISH, TICK, CHOICE = "begin", "finish", "tick", "choice"
@@ -130,6 +130,11 @@ class _Player:
             play(self._pipeline, item, as_told=self._as_told)
         except Refused as error:
             self.notes.append(str(error))
+        except (RoutineError, LookupError, TypeError, ValueError, AttributeError) as error:
+            if isinstance(item, Record):
+                raise
+            self.notes.append(f"an event in it makes no sense ({error!r}): {item.content}")
+            return
         if isinstance(item, Event) and item.content.get("event") == BEGIN and "past" in item.content:
             self._begun(item.content["past"])
 

@@ -10,6 +10,7 @@ from polecal.daemon.config import SPAN, loads
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Recorder
+from polecal.daemon.replay import BEGIN, replay
 from polecal.daemon.results import setup_of
 from polecal.drivers.emulated.virtual import Rig, play
 
@@ -46,10 +47,17 @@ def rows() -> Iterator[tuple[object, ...]]:
         began_s = time.perf_counter()
         estimate(moments, setup, everywhere=everywhere)
         yield f"{what}, {len(passes)} passes", (time.perf_counter() - began_s) * 1e3, "ms"
-    with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "capture.mcap", {}) as recorder:
-        began_s = time.perf_counter()
-        for name, t_ns, data in chunks:
-            recorder.write(name, "rx", t_ns, data)
-        took_s = time.perf_counter() - began_s
-        yield "recorder: cost of a message", took_s / len(chunks) * 1e6, "µs"
-        yield "recorder: size", recorder.size_bytes / SECONDS * 60 / 1e6, "MB a minute"
+    told = {"session": "bench", "created": "", "config": CONFIG}
+    with tempfile.TemporaryDirectory() as folder:
+        with Recorder(Path(folder) / "capture.mcap", told) as recorder:
+            recorder.event(T0_NS, {"event": BEGIN})
+            began_s = time.perf_counter()
+            for name, t_ns, data in chunks:
+                recorder.write(name, "rx", t_ns, data)
+            took_s = time.perf_counter() - began_s
+            yield "recorder: cost of a message", took_s / len(chunks) * 1e6, "µs"
+            yield "recorder: size", recorder.size_bytes / SECONDS * 60 / 1e6, "MB a minute"
+        began_s, began_cpu_s = time.perf_counter(), time.process_time()
+        replay(recorder.path, None, None, None)
+        yield "replay: speed", SECONDS / (time.perf_counter() - began_s), "times real time"
+        yield "replay: speed, by its own CPU time", SECONDS / (time.process_time() - began_cpu_s), "times"

@@ -8,7 +8,9 @@ import sys
 
 import pytest
 import yaml
+from mcap.writer import Writer
 
+from polecal import PolecalError
 from polecal.daemon import config as configuration
 from polecal.daemon.config import ConfigError
 from polecal.daemon.recorder import Recorder, RecorderError
@@ -171,3 +173,51 @@ def test_a_place_that_cannot_be_written_to_says_so(settings, tmp_path):
     with pytest.raises(SessionError, match="out") as caught:
         replay(path, None, tmp_path / "out", None)
     assert caught.value.hint
+
+
+def test_a_flipped_bit_anywhere_is_told_and_what_is_whole_is_used(settings, tmp_path):
+    path = short(
+        tmp_path / "c.mcap",
+        settings(),
+        (10**9, {"event": BEGIN}),
+        (2 * 10**9, {"event": "tick"}),
+        (3 * 10**9, {"event": FINISH, "why": "asked to stop"}),
+    )
+    whole = path.read_bytes()
+    damaged = tmp_path / "damaged.mcap"
+    end = whole.index(b"\x0f\x04" + bytes(7))  # DataEnd
+    used, hints = 0, []
+    for at in range(0, len(whole), 5):
+        damaged.write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :])
+        try:
+            outcome = replay(damaged, None, tmp_path / "out", None)
+        except PolecalError as error:
+            hints.append(error.hint)
+        else:
+            assert (outcome.cut is not None) or at > end  # behind it is nothing that is used
+            used += 1
+    assert min(used, len(hints)) > 10
+    assert all(hints)
+
+
+@pytest.mark.parametrize("content", [[1], {"event": FINISH}, {"event": BEGIN, "past": 7}])
+def test_an_event_that_makes_no_sense_is_told_and_the_rest_is_used(settings, tmp_path, content):
+    path = short(tmp_path / "c.mcap", settings(), (1, {"event": BEGIN}), (2, content))
+    outcome = replay(path, None, tmp_path / "out", None)
+    assert "makes no sense" in outcome.cut or "is damaged" in outcome.cut
+    assert outcome.status["state"] == "rejected"
+
+
+def test_a_folder_without_a_capture_and_another_programs_are_refused(tmp_path):
+    other = tmp_path / "other.mcap"
+    with other.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_message(writer.register_channel("/chatter", "json", 0), 1, b"{}", 1)
+        writer.finish()
+    for path, says in ((tmp_path / "nothing", "no capture"), (other, "not recorded by polecal")):
+        (tmp_path / "nothing").mkdir(exist_ok=True)
+        with pytest.raises(RecorderError, match=says) as caught:
+            replay(path, None, tmp_path / "out", None)
+        assert caught.value.hint
+    assert not (tmp_path / "out").exists()
