@@ -119,6 +119,8 @@ class Result:
     set_aside: dict[int, str]
     returns: dict[Kind, int]
     verdict: Verdict
+    left_out: dict[int, Array]
+    """(6,) m and rad, the mount without a used pass, by its id; empty where there are too few."""
 
 
 def sum_of(blocks: Iterable[Moments]) -> Moments:
@@ -425,6 +427,9 @@ class _Problem:
                 Kind.GROUND: int(self.ground.count[used].sum()),
             },
             verdict=verdict,
+            left_out={}
+            if found.left_out is None
+            else {one.id: row[:6] for one, row in zip(passes, found.left_out, strict=True)},
         )
 
     def _minimum_of(self, numbers: Sequence[int], found: _Found) -> Array:

@@ -23,11 +23,10 @@ from polecal.calib.observations import (
     points_nav,
 )
 from polecal.calib.solve import EXTRAS
-from polecal.calib.uncertainty import FEWEST_PASSES
 
 _NEAR_M = 2.0  # of the pole: the ground that is drawn with it
 _MOST_DRAWN = 6000
-_MOST_WEIGHED = 60  # passes that are left out in turn: beyond, one says little
+_STEPS = 12  # of the cost curve
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +237,7 @@ def _curve(
     passes: Sequence[Pass], counts: NDArray[np.int64], setup: Setup, timed: Returns
 ) -> tuple[tuple[int, int, float], ...]:
     """Calibrate on the first 1, 2, … passes, and cost each mount on all returns: Fig. 7."""
-    steps = np.unique(np.linspace(1, len(passes), min(len(passes), _MOST_WEIGHED)).astype(int))
+    steps = np.unique(np.linspace(1, len(passes), min(len(passes), _STEPS)).astype(int))
     curve = []
     for number in steps.tolist():
         try:
@@ -253,15 +252,8 @@ def _curve(
 def _weights(
     seen: Sequence[Seen], passes: Sequence[Pass], setup: Setup, residuals: Residuals
 ) -> tuple[Weight, ...]:
-    """Leave out one pass at a time, in the order of ``seen``; ``passes`` are the used ones."""
-    shifts: dict[int, Array] = {}
-    if FEWEST_PASSES < len(passes) <= _MOST_WEIGHED:
-        whole = estimate(passes, setup).mount.vector
-        for left_out in passes:
-            rest = [other for other in passes if other is not left_out]
-            shift = estimate(rest, setup).mount.vector - whole
-            shift[3:] = wrap(shift[3:])
-            shifts[left_out.id] = shift
+    """Say of each pass what it gave, in the order of ``seen``; ``passes`` are the used ones."""
+    whole = estimate(passes, setup)
     first_ns = min(one.t_ns[0] for one in seen)
     weights, at = [], 0
     for one in seen:
@@ -284,11 +276,19 @@ def _weights(
                 pole=count,
                 ground=len(one.returns) - count,
                 off_m=off_m,
-                shift=shifts.get(one.id),
+                shift=_shift(whole.left_out.get(one.id), whole.mount),
                 why_not=one.why_not,
             )
         )
     return tuple(weights)
+
+
+def _shift(left_out: Array | None, mount: Mount) -> Array | None:
+    if left_out is None:
+        return None
+    shift = left_out - mount.vector
+    shift[3:] = wrap(shift[3:])
+    return shift
 
 
 def _speed(returns: Returns) -> float:
