@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +38,7 @@ _REVOLUTION_NS = round(REVOLUTION_S * 1e9)
 _MIRROR_DRIFT = 5e-3  # a motor, not a crystal: 75 Hz is 13.33 ms, the sheet's 148 µs word says 13.32 ms
 _SILENCE_NS = 2_000_000_000  # after which it may have been switched off, and count from anywhere
 _EARLY_SCANS = 0.1  # by which a clock that is still being learnt may put a scan too late
+_TOGETHER_NS = 1_000_000_000  # a second's scans are placed at once: one by one it takes four times as long
 _MOST_WAITING = 256  # scans that wait for their poses: 14 s at 18.8 Hz
 _SLOWEST_MPS, _SLOWEST_RADPS = 0.05, 0.02  # a vehicle that stands adds weight and no information
 _GATE_M = (0.5, 2.5)
@@ -166,17 +166,16 @@ class LaserChannel:
         return count + self._scan_revolutions * max(1, scans)
 
     def fuse(self) -> list[StoredPass]:
-        """Place the scans whose poses are all there; give the passes that have ended."""
-        while self._waiting and self._gps_clock.locked:  # a clock that starts anew is seconds off at first
-            stx_gps_ns = self._gps_clock.to_device(self._waiting[0].stx_ns)
-            if stx_gps_ns - self._youngest_ns > self._trajectory.last_ns:
-                break
-            self._place(self._waiting.popleft(), stx_gps_ns - self._age_ns)
+        """Place scans once a second of them waits; give the passes that have ended."""
+        if self._waiting and self._seen_ns - self._waiting[0].stx_ns >= _TOGETHER_NS:
+            self._place_next()
         oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns
         return self._closed(oldest_ns)
 
     def end(self) -> list[StoredPass]:
-        """Close what is open, at the end of a run."""
+        """Place what can be placed and close what is open, at the end of a run."""
+        while self._place_next():
+            pass
         return self._closed(None)
 
     def _closed(self, t_ns: int | None) -> list[StoredPass]:
@@ -185,22 +184,54 @@ class LaserChannel:
             self.dropped[UNEVEN] = self._builder.uneven
         return passes
 
-    def _place(self, scan: _Waiting, gps_ns: NDArray[np.int64]) -> None:
-        poses = self._trajectory.at(gps_ns)
-        known = poses.known
+    def _place_next(self) -> bool:
+        """Place the oldest scans whose poses are there, of a second at most; say if there were any."""
+        scans: list[_Waiting] = []
+        stx_gps_ns: list[int] = []
+        while self._waiting and self._gps_clock.locked:  # a clock that starts anew is seconds off at first
+            scan = self._waiting[0]
+            gps_ns = self._gps_clock.to_device(scan.stx_ns)
+            if gps_ns - self._youngest_ns > self._trajectory.last_ns:
+                break
+            if scans and scan.stx_ns - scans[0].stx_ns > _TOGETHER_NS:
+                break
+            scans.append(self._waiting.popleft())
+            stx_gps_ns.append(gps_ns)
+        if scans:
+            self._place(scans, np.array(stx_gps_ns)[:, None] - self._age_ns)
+        return bool(scans)
+
+    def _place(self, scans: list[_Waiting], gps_ns: NDArray[np.int64]) -> None:
+        """Place K scans of N beams, whose GPS times are (K, N)."""
+        poses = self._trajectory.at(gps_ns.ravel())
+        known = poses.known.reshape(gps_ns.shape)
         self.dropped[NO_POSE] += int(np.count_nonzero(~known))
-        if not known.any():
-            return
-        speed = np.linalg.norm(poses.velocity_mps[known], axis=1).mean()
-        turning = np.linalg.norm(poses.rate_radps[known], axis=1).mean()
-        if speed < _SLOWEST_MPS and turning < _SLOWEST_RADPS:
-            self.dropped[STANDING] += int(np.count_nonzero(known))
-            return
-        range_m = np.where(known, scan.range_m, np.nan)
-        kind = np.full(len(range_m), Kind.GROUND, dtype=np.uint8)
-        every = observed(np.nan_to_num(range_m), self._bearing_rad, poses, kind)
-        points = points_nav(every, self.mount)
-        ground = self._ground.beams(range_m, scan.reflectivity, points[:, 2])
+        standing = _mean_norm(poses.velocity_mps, known) < _SLOWEST_MPS
+        standing &= _mean_norm(poses.rate_radps, known) < _SLOWEST_RADPS
+        self.dropped[STANDING] += int(np.count_nonzero(known[standing]))
+        range_m = np.where(known, np.stack([scan.range_m for scan in scans]), np.nan)
+        kind = np.full(gps_ns.size, Kind.GROUND, dtype=np.uint8)
+        bearing_rad = np.tile(self._bearing_rad, len(scans))
+        every = observed(np.nan_to_num(range_m).ravel(), bearing_rad, poses, kind)
+        points = points_nav(every, self.mount).reshape(*gps_ns.shape, 3)
+        seen: defaultdict[int, list[tuple[int, NDArray[np.int64]]]] = defaultdict(
+            list
+        )  # by place: stamp, rows
+        for number in np.flatnonzero(~standing).tolist():
+            scan, first = scans[number], number * len(self._bearing_rad)
+            ground = self._ground.beams(range_m[number], scan.reflectivity, points[number, :, 2])
+            for place, beams in self._sighted(scan, known[number], points[number]).items():
+                kind[first + beams] = Kind.POLE  # of ``every``, too
+                seen[place].append((scan.stx_ns, first + np.concatenate([beams, ground])))
+        for place, parts in seen.items():
+            rows = np.concatenate([part for _, part in parts])
+            self._builder.add(place, (parts[0][0], parts[-1][0]), gps_ns.ravel()[rows], every[rows])
+
+    def _sighted(
+        self, scan: _Waiting, known: NDArray[np.bool_], points: NDArray[np.float64]
+    ) -> dict[int, NDArray[np.int64]]:
+        """Give the beams that met what could be the pole, by place; ``points`` are all beams' (N, 3) in n."""
+        sighted: dict[int, NDArray[np.int64]] = {}
         for reflector in scan.found:
             beams = reflector.beams[known[reflector.beams]]
             if not len(beams):
@@ -209,14 +240,19 @@ class LaserChannel:
             place = self.places.sight(at_ne_m, self._gate_m(reflector.range_m), thin=reflector.thin)
             if place is None or not reflector.thin or not self.places.could_be_pole(place):
                 self.dropped[OTHER_REFLECTOR] += len(beams)
-                continue
-            used = np.concatenate([beams, ground])
-            kind[beams] = Kind.POLE
-            self._builder.add(place, scan.stx_ns, gps_ns[used], every[used])
-            kind[beams] = Kind.GROUND
+            else:  # one reflector may be seen in pieces
+                sighted[place] = np.concatenate([sighted[place], beams]) if place in sighted else beams
+        return sighted
 
     def _gate_m(self, range_m: float) -> float:
         """How far off the hand measurement may put a sighting."""
         sigma = self._laser.mount_sigma
-        wide_m = 2 * (sigma.xyz_m + range_m * np.radians(sigma.rpy_deg))
-        return cast(float, min(max(wide_m, _GATE_M[0]), _GATE_M[1]))
+        wide_m = 2 * (sigma.xyz_m + range_m * math.radians(sigma.rpy_deg))
+        return min(max(wide_m, _GATE_M[0]), _GATE_M[1])
+
+
+def _mean_norm(vectors: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Give the mean length (K,) of each scan's vectors (K N, 3) where they are known, 0 where none is."""
+    lengths = np.sqrt(np.einsum("ni,ni->n", vectors, vectors)).reshape(known.shape)
+    mean: NDArray[np.float64] = np.where(known, lengths, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    return mean

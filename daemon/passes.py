@@ -84,13 +84,16 @@ class PassBuilder:
     def add(
         self,
         place: int,
-        t_ns: int,
+        t_ns: tuple[int, int],
         gps_ns: NDArray[np.int64],
         returns: Returns,
     ) -> None:
-        """Add one scan's returns of the reflector at ``place`` and of the ground."""
-        current = self._open.setdefault(place, _Open(t_ns, t_ns, []))
-        current.last_ns = t_ns
+        """Add some scans' returns of the reflector at ``place`` and of the ground.
+
+        ``t_ns`` is the host time of the first and of the last of these scans.
+        """
+        current = self._open.setdefault(place, _Open(*t_ns, []))
+        current.last_ns = t_ns[1]
         current.parts.append((gps_ns, returns))
 
     def close(self, mount: Mount, t_ns: int | None = None) -> list[StoredPass]:

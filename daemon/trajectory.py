@@ -93,36 +93,39 @@ class Trajectory:
         if self._count < 2 or not len(gps_ns):
             nothing = np.zeros((len(gps_ns), 3))
             return Poses(np.zeros(len(gps_ns), dtype=bool), *[nothing] * 6)
-        first_ns, last_ns = self._gps_ns[0], self._gps_ns[self._count - 1]
-        early_ns, late_ns = (np.clip(gps_ns + side, first_ns, last_ns) for side in (-_ASIDE_NS, _ASIDE_NS))
-        known, state, rate = self._interpolated(np.concatenate([gps_ns, early_ns, late_ns]))
-        turning = _body_rate(state[:, 3:], rate[:, 3:])
-        here, early, late = (slice(k * len(gps_ns), (k + 1) * len(gps_ns)) for k in range(3))
-        apart_s = np.maximum(late_ns - early_ns, 1)[:, None] * 1e-9
-        return Poses(
-            known=known[here],
-            position_m=state[here, :3],
-            rpy_rad=state[here, 3:],
-            velocity_mps=rate[here, :3],
-            rate_radps=turning[here],
-            acceleration_mps2=(rate[late, :3] - rate[early, :3]) / apart_s,
-            angular_acceleration_radps2=(turning[late] - turning[early]) / apart_s,
-        )
-
-    def _interpolated(self, gps_ns: Times) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Give where it is known, the state (N, 6) and its rate of change: straight lines between poses."""
-        first, last = np.searchsorted(self._gps_ns[: self._count], (gps_ns.min(), gps_ns.max()))
-        start = max(0, min(int(first), self._count - 1) - 1)
-        rows = slice(start, min(max(int(last) + 1, start + 2), self._count))
-        times, states = self._gps_ns[rows], self._state[rows]
+        times, states = self._between(int(gps_ns.min()) - _ASIDE_NS, int(gps_ns.max()) + _ASIDE_NS)
+        # straight lines between poses: each stretch has one rate of change, that of b as in its middle
         spans_ns = np.diff(times)
         rates = np.diff(states, axis=0) / (spans_ns * 1e-9)[:, None]
-        before = np.clip(np.searchsorted(times, gps_ns), 1, len(times) - 1) - 1
-        span_ns = spans_ns.take(before)
-        part_ns = gps_ns - times.take(before)
-        known = (span_ns <= self._gap_ns) & (part_ns >= 0) & (part_ns <= span_ns)
-        rate = rates.take(before, axis=0)
-        return known, states.take(before, axis=0) + rate * (part_ns * 1e-9)[:, None], rate
+        turning = _body_rate((states[:-1, 3:] + states[1:, 3:]) / 2, rates[:, 3:])
+        changes = np.concatenate([rates[:, :3], turning], axis=1)
+
+        def stretch_of(at_ns: Times) -> NDArray[np.intp]:
+            return np.clip(np.searchsorted(times, at_ns), 1, len(spans_ns)) - 1
+
+        before = stretch_of(gps_ns)
+        span_ns, part_ns = spans_ns.take(before), gps_ns - times.take(before)
+        state = states.take(before, axis=0) + rates.take(before, axis=0) * (part_ns * 1e-9)[:, None]
+        change = changes.take(before, axis=0)
+        early_ns, late_ns = (np.clip(gps_ns + side, times[0], times[-1]) for side in (-_ASIDE_NS, _ASIDE_NS))
+        changed = changes.take(stretch_of(late_ns), axis=0) - changes.take(stretch_of(early_ns), axis=0)
+        changed /= np.maximum(late_ns - early_ns, 1)[:, None] * 1e-9
+        return Poses(
+            known=(span_ns <= self._gap_ns) & (part_ns >= 0) & (part_ns <= span_ns),
+            position_m=state[:, :3],
+            rpy_rad=state[:, 3:],
+            velocity_mps=change[:, :3],
+            rate_radps=change[:, 3:],
+            acceleration_mps2=changed[:, :3],
+            angular_acceleration_radps2=changed[:, 3:],
+        )
+
+    def _between(self, first_ns: int, last_ns: int) -> tuple[Times, Array]:
+        """Give the times and states of the poses from before one time to behind another, two at least."""
+        first, last = np.searchsorted(self._gps_ns[: self._count], (first_ns, last_ns)).tolist()
+        start = max(0, min(first, self._count - 1) - 1)
+        rows = slice(start, min(max(last + 1, start + 2), self._count))
+        return self._gps_ns[rows], self._state[rows]
 
 
 def _body_rate(rpy_rad: Array, rpy_rate_radps: Array) -> Array:

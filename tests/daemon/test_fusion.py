@@ -114,6 +114,15 @@ def test_a_second_post_on_one_side_does_not_count(begun, settings, streaming, dr
         assert laser["estimate"][key] == pytest.approx(getattr(truth.mount, key), abs=0.03)
 
 
+def test_a_return_counts_once_though_the_pole_is_seen_in_pieces(recorded):
+    """The ground beside it, too."""
+    passes = [stored for _, stored in recorded.played.passes]
+    assert len(passes) > 3
+    for stored in passes:
+        beams = np.column_stack([stored.gps_ns, np.round(np.degrees(stored.returns.bearing_rad) * 100)])
+        assert len(np.unique(beams, axis=0)) == len(beams)
+
+
 def test_where_there_is_a_plate_and_no_pole_nothing_is_calibrated(begun, settings, streaming, drive):
     truth = drive.world
     world = World(
@@ -206,6 +215,18 @@ def test_a_vehicle_that_stands_adds_nothing(begun, settings, streaming, parked):
     assert State.COLLECTING in played.states
     assert not played.passes
     assert played.dropped()[fusion.STANDING] > 10_000
+
+
+def test_what_waits_to_be_placed_when_a_run_ends_is_placed(begun, settings, streaming):
+    """Scans are placed by the second, and a run may end at any moment."""
+    chunks = streaming(world_of(straight(3.0)), 18.4)  # the pole is in view
+    longer = begun(settings()).feed(chunks).finish()
+    shorter = (
+        begun(settings()).feed(chunk for chunk in chunks if chunk[1] < chunks[-1][1] - 400_000_000).finish()
+    )
+    (one,), (other,) = ([stored for _, stored in each.passes] for each in (longer, shorter))
+    assert 0.3e9 < one.t_ns[1] - other.t_ns[1] < 0.5e9
+    assert np.array_equal(one.gps_ns[: len(other.gps_ns)], other.gps_ns)
 
 
 def test_scans_of_another_variant_are_counted_and_not_used(begun, settings, streaming, t0_ns, drive):

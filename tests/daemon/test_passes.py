@@ -24,7 +24,7 @@ def returns(pole, ground=0, at=0.0):
 def seen(builder, place, moments_s, pole=10):
     for moment_s in moments_s:
         t_ns = round(moment_s * SECOND)
-        builder.add(place, t_ns, np.full(pole + 5, t_ns + 7), returns(pole, 5, moment_s))
+        builder.add(place, (t_ns, t_ns), np.full(pole + 5, t_ns + 7), returns(pole, 5, moment_s))
 
 
 @pytest.fixture
