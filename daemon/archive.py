@@ -30,7 +30,7 @@ from polecal.daemon.replay import BEGIN, CHOICE
 from polecal.daemon.routine import State
 from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, Session, SessionError, captures_of
 
-_OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "port")
+_OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "page", "port")
 """Keys of the configuration that may change from day to day."""
 
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, yaml.YAMLError)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from collections.abc import Hashable
 from pathlib import Path
@@ -337,6 +338,34 @@ class Storage(_Part):
     """Whether a closed capture has scans, fixes, frames and clouds in it, too, for robot tools."""
 
 
+def split_address(listen: str) -> tuple[str, int]:
+    """Take an IP address and a port apart, as in 127.0.0.1:8291 or [::1]:8291. Raises ValueError."""
+    host, _, port = listen.rpartition(":")
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    address = ipaddress.ip_address(bare)
+    if (address.version == 6) is (bare == host) or not re.fullmatch("[0-9]{1,5}", port):
+        raise ValueError(listen)
+    if not 0 < int(port) <= 0xFFFF:
+        raise ValueError(listen)
+    return bare, int(port)
+
+
+def _address(listen: str) -> str:
+    try:
+        split_address(listen)
+    except ValueError as error:
+        raise _fault(f"must be an IP address and a port, as 127.0.0.1:8291, not {listen!r}") from error
+    return listen
+
+
+class Page(_Part):
+    """A page for a tablet's browser, which shows what `status` does and changes nothing; off by default."""
+
+    listen: Annotated[str, AfterValidator(_address)] | None = None
+    """The IP address and port that it is served at, as 127.0.0.1:8291; null: nowhere. Who reaches it can
+    look: there is no password."""
+
+
 class Config(_Part):
     """All that the daemon is told."""
 
@@ -356,6 +385,8 @@ class Config(_Part):
     """What makes a calibration good enough."""
     storage: Storage = Storage()
     """How much of the disk sessions may take."""
+    page: Page = Page()
+    """A page for a tablet."""
 
     @property
     def socket(self) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import faulthandler
 import queue
 import re
@@ -100,7 +101,7 @@ class Service:
             changed = [
                 key for key in Config.model_fields if getattr(config, key) != getattr(self._config, key)
             ]
-            if moved := [key for key in changed if key in ("state_dir", "runtime_dir")]:
+            if moved := [key for key in changed if key in ("state_dir", "runtime_dir", "page")]:
                 raise Refused(
                     f"{' and '.join(moved)} cannot change while the daemon runs",
                     "restart it: systemctl restart polecal",
@@ -310,13 +311,22 @@ def _serve(path: str, config: Config) -> int:
         config.state_dir, config.storage.min_free_mb * 1_000_000, decoded=config.storage.decoded
     )
     service = Service(config, finaliser.add)
-    with ControlServer(config.socket, service), finaliser:
+    with ControlServer(config.socket, service), finaliser, _page_of(config, service):
         structlog.get_logger().info("ready", socket=str(config.socket), release=__version__)
         manager.ready()
         _attend(service, manager, signals, path)
         manager.stopping()
         _close(service, manager)
     return 0
+
+
+def _page_of(config: Config, service: Service) -> contextlib.AbstractContextManager[object]:
+    """Give the page for a tablet, if the configuration asks for one."""
+    if config.page.listen is None:
+        return contextlib.nullcontext()
+    from polecal.daemon.page import Page  # noqa: PLC0415 - an HTTP server that most daemons do without
+
+    return Page(config.page.listen, service.handle, config.state_dir)
 
 
 def _attend(service: Service, manager: Manager, signals: queue.SimpleQueue[int], path: str) -> None:

@@ -20,7 +20,7 @@ def test_wheel_holds_every_module_of_the_tree(tmp_path):
     names = set(zipfile.ZipFile(wheel).namelist())
     modules = {"polecal/__init__.py", "polecal/py.typed"}
     for folder in ("calib", "daemon", "drivers"):
-        for kind in ("*.py", "*.j2"):
+        for kind in ("*.py", "*.j2", "*.html"):
             modules |= {f"polecal/{path.relative_to(ROOT)}" for path in (ROOT / folder).rglob(kind)}
     assert modules <= names
     assert not {name for name in names if name.split("/")[0] in ("calib", "daemon", "drivers", "tests")}

@@ -48,6 +48,44 @@ def test_a_misspelt_key_would_be_found(unit):
     assert "ProtectHmoe" in analyze("verify", "--man=no", unit).stderr
 
 
+@pytest.fixture
+def with_page(unit):
+    """The unit with the drop-in for the page."""
+    folder = unit.with_name(f"{unit.name}.d")
+    folder.mkdir()
+    shutil.copy(FOLDER / "page.conf", folder)
+    return unit
+
+
+@analyzed
+def test_the_pages_drop_in_has_no_key_that_systemd_does_not_know(with_page):
+    done = analyze("verify", "--man=no", with_page)
+    assert [line for line in done.stderr.splitlines() if "page.conf" in line or UNIT.name in line] == []
+    drop_in = with_page.with_name(f"{UNIT.name}.d") / "page.conf"
+    drop_in.write_text(drop_in.read_text().replace("SocketBindAllow=", "SocketBnidAllow="))
+    assert "SocketBnidAllow" in analyze("verify", "--man=no", with_page).stderr
+
+
+@analyzed
+def test_the_pages_drop_in_opens_one_port_to_this_machine_and_nothing_else(with_page):
+    before, after = closed_by(UNIT), closed_by(with_page)
+    assert before - after == {"PrivateNetwork=", "IPAddressDeny=", "RestrictAddressFamilies=~AF_(INET|INET6)"}
+    said = (FOLDER / "page.conf").read_text()
+    keys = [line for line in said.splitlines() if line and line[0] not in "#["]
+    assert keys == [
+        "PrivateNetwork=no",
+        "RestrictAddressFamilies=AF_INET AF_INET6",
+        "SocketBindAllow=tcp:8291",
+        "IPAddressAllow=localhost",
+    ]
+
+
+def closed_by(unit):
+    """The restrictions that systemd finds in a unit."""
+    done = analyze("security", "--offline=true", "--no-pager", unit)
+    return {line.split()[1] for line in done.stdout.splitlines() if line.startswith("✓")}
+
+
 @analyzed
 def test_unit_is_as_closed_as_a_serial_daemon_can_be(unit):
     done = analyze("security", "--offline=true", "--no-pager", unit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -38,6 +39,7 @@ from polecal.drivers.emulated.virtual import STREAM_LOGS, play
 from polecal.drivers.emulated.world import HAND_MEASURED, World, demo_world
 
 T0_NS = 1_000_000_000_000
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 MEASURED = {key: getattr(HAND_MEASURED, key) for key in KEYS}
 POLE = {"radius_m": 0.04, "height_m": 2.4}
 
@@ -389,3 +391,16 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
 
     with ExitStack() as stack:
         yield lambda size: stack.enter_context(_tmpfs(tmp_path / "disk", size))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Headless Chromium, the system's or the test package's own."""
+    sync = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    with sync.sync_playwright() as playwright:
+        if path is None and not os.path.exists(playwright.chromium.executable_path):
+            pytest.skip("no Chromium here: apt-get install chromium")
+        shown = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield shown
+        shown.close()

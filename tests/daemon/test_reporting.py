@@ -1,7 +1,6 @@
 """A session's report, as a browser without a network shows it, of good runs, bad ones and old ones."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -22,20 +21,6 @@ from polecal.daemon.service import Service
 from polecal.daemon.sessions import SessionError
 
 WIDTHS = (1280, 820)
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """Headless Chromium, the system's or the test package's own."""
-    sync = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    with sync.sync_playwright() as playwright:
-        if path is None and not os.path.exists(playwright.chromium.executable_path):
-            pytest.skip("no Chromium here: apt-get install chromium")
-        shown = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield shown
-        shown.close()
 
 
 @pytest.fixture
