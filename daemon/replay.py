@@ -16,7 +16,7 @@ from polecal.daemon.control import Refused
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Event, Record, RecorderError
 from polecal.daemon.routine import RoutineError, State
-from polecal.daemon.sessions import CALIBRATION, Session, SessionError, captures_of
+from polecal.daemon.sessions import CALIBRATION, CAPTURED_IN, Session, SessionError, captures_of
 
 BEGIN, FINISH, TICK, CHOICE = "begin", "finish", "tick", "choice"
 """Events that are inputs of the pipeline, and so part of a replay."""
@@ -63,7 +63,7 @@ def replay(
     out: Path | None,
     progress: Callable[[float], None] | None,
 ) -> Outcome:
-    """Play a session through the pipeline; calibration and passes go to ``out``.
+    """Play a session through the pipeline; ``out`` becomes a folder like a session's, without its capture.
 
     ``capture`` is its folder or its capture; a session that was gone on with is played from its first day
     on, and what was dropped after its end is dropped. ``config`` is a configuration file, else the capture's
@@ -77,6 +77,11 @@ def replay(
     recorded = sources[0].metadata
     settings = configuration.load(config) if config else configuration.loads(recorded["config"], str(capture))
     out = out or capture.parent / "replay"
+    if out.resolve() == capture.parent.resolve():
+        raise SessionError(
+            f"{out}: is the session itself, whose passes and calibration would be lost",
+            "name another folder to write to",
+        )
     session = Session(out, recorded["created"])
     try:
         (out / "passes").mkdir(parents=True, exist_ok=True)
@@ -86,6 +91,10 @@ def replay(
         raise SessionError(
             f"{out}: cannot be made: {error.strerror}", "name another folder to write to"
         ) from error
+    session.write_told(
+        session.metadata(settings)
+        | {"session": recorded["session"], CAPTURED_IN: str(capture.parent.resolve())}
+    )
     pipeline = Pipeline(
         settings, session=recorded["session"], created=recorded["created"], on_pass=session.write_pass
     )

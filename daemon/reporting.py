@@ -29,7 +29,7 @@ from polecal.daemon import recorder, results, sessions
 from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.navigation import name_of
 from polecal.daemon.recorder import Event, RecorderError
-from polecal.daemon.sessions import CALIBRATION, SessionError
+from polecal.daemon.sessions import CALIBRATION, CAPTURED_IN, SessionError, captures_of
 from polecal.drivers.novatel_span import Framer, accuracy, nav_state, parse
 
 if TYPE_CHECKING:  # matplotlib is an extra
@@ -114,7 +114,7 @@ def _page(folder: Path) -> Page:
     from polecal.calib.report.page import Report, render  # noqa: PLC0415
 
     meta, home = _metadata(folder)
-    config = configuration.loads(meta["config"], str(home / "session.yaml"))
+    config = configuration.loads(meta["config"], str(folder / "session.yaml"))
     content: dict[str, Any] = {}
     if (folder / CALIBRATION).exists():
         content = sessions.read_calibration(folder)
@@ -156,21 +156,19 @@ def _page(folder: Path) -> Page:
 
 
 def _metadata(folder: Path) -> tuple[dict[str, str], Path]:
-    """Find what a session was told, in its folder or, of a replay, in the one around it."""
-    for home in (folder, folder.parent):
-        path = home / "session.yaml"
-        try:
-            told = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            continue
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise SessionError(f"{path}: cannot be read: {error}", "replay the session's capture") from error
-        if isinstance(told, dict) and {"session", "config"} <= told.keys():
-            return told, home
-        raise SessionError(f"{path}: does not say how the session was made", "replay the session's capture")
-    raise SessionError(
-        f"{folder}: is no session's folder", "name one with a session.yaml in it, or replay its capture"
-    )
+    """Find what a session was told, and the folder of its captures: of a replay, the one it was made from."""
+    path = folder / "session.yaml"
+    try:
+        told = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise SessionError(
+            f"{folder}: is no session's folder", "name one with a session.yaml in it, or replay its capture"
+        ) from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise SessionError(f"{path}: cannot be read: {error}", "replay the session's capture") from error
+    if isinstance(told, dict) and {"session", "config"} <= told.keys():
+        return told, Path(told.get(CAPTURED_IN, folder))
+    raise SessionError(f"{path}: does not say how the session was made", "replay the session's capture")
 
 
 def _facts(meta: Mapping[str, str], folder: Path, content: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -188,7 +186,7 @@ def _facts(meta: Mapping[str, str], folder: Path, content: Mapping[str, Any]) ->
 def _listen(home: Path, notes: list[str]) -> _Heard:
     """Read what the receiver told of itself from the captures in a folder."""
     heard = _Heard()
-    captures = sorted(home.glob("capture*.mcap"), key=lambda path: (len(path.name), path.name))
+    captures = captures_of(home)
     if not captures:
         notes.append("There is no capture in the session's folder: nothing is told of the navigation.")
     for path in captures:

@@ -24,6 +24,8 @@ from polecal.daemon.quality import Quality
 
 CAPTURE = "capture.mcap"
 CALIBRATION = "calibration.yaml"
+CAPTURED_IN = "captured_in"
+"""What ``session.yaml`` calls the folder with the captures, where it is another one: of a replay."""
 CAPTURES = "capture*.mcap"
 """Matches all captures of a session's folder."""
 _LATER = "capture-{}.mcap"
@@ -62,6 +64,11 @@ class Session:
             "polecal": __version__,
             "config": dump(config),
         }
+
+    def write_told(self, told: dict[str, str]) -> None:
+        """Write ``session.yaml``: what the run was told. Raises SessionError."""
+        with _whole_file(self.folder / "session.yaml") as file:
+            file.write(yaml.safe_dump(told, sort_keys=False).encode())
 
     def write_pass(self, laser: str, stored: StoredPass) -> None:
         """Write a closed pass. Raises SessionError."""
@@ -126,8 +133,7 @@ def create(state_dir: Path, config: Config, name: str | None) -> Session:
             "see that state_dir is there, has room, and that this user may write to it",
         ) from error
     session = Session(folder, now.isoformat(timespec="seconds"))
-    with _whole_file(folder / "session.yaml") as file:
-        file.write(yaml.safe_dump(session.metadata(config), sort_keys=False).encode())
+    session.write_told(session.metadata(config))
     return session
 
 

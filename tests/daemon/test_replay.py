@@ -52,6 +52,22 @@ def test_it_gives_the_live_runs_calibration_byte_for_byte(recorded, again):
     assert (out / CALIBRATION).read_bytes() == (recorded.session.folder / CALIBRATION).read_bytes()
 
 
+def test_it_never_writes_over_the_session_that_it_plays(recorded):
+    before = (recorded.session.folder / CALIBRATION).read_bytes()
+    with pytest.raises(SessionError, match="is the session itself") as caught:
+        replay(recorded.session.capture, None, recorded.session.folder / "passes" / "..", None)
+    assert caught.value.hint == "name another folder to write to"
+    assert (recorded.session.folder / CALIBRATION).read_bytes() == before
+
+
+def test_it_says_what_was_played_with_which_configuration(recorded, again):
+    out, _ = again
+    told = yaml.safe_load((out / "session.yaml").read_text())
+    assert told == yaml.safe_load((recorded.session.folder / "session.yaml").read_text()) | {
+        "captured_in": str(recorded.session.folder)
+    }
+
+
 def test_it_gives_the_same_passes_and_status(recorded, again):
     out, shown = again
     live = recorded.session.folder / "passes"
