@@ -7,12 +7,14 @@ Drawing takes seconds of calculation, so the daemon has it done by a process of 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import importlib.util
 import os
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,9 +65,10 @@ def write(folder: Path, out: Path | None = None, png: Path | None = None) -> Pat
             f"a report needs {lack}, which is not installed",
             "install polecal with its extra: pip install 'polecal[report]'",
         )
-    page = _page(folder)
     path = out or folder / NAME
-    sessions.write_whole(path, page.html.encode())
+    with _alone(folder):
+        page = _page(folder)
+        sessions.write_whole(path, page.html.encode())
     if png is not None:
         try:
             png.mkdir(parents=True, exist_ok=True)
@@ -74,6 +77,20 @@ def write(folder: Path, out: Path | None = None, png: Path | None = None) -> Pat
         for drawing in page.drawings:
             sessions.write_whole(png / f"{drawing.name}.png", drawing.png)
     return path
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Wait until nobody else writes the folder's report: at a run's end the daemon does, and one may ask."""
+    try:
+        held = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise SessionError(f"{folder}: {error.strerror}", "see `polecal-field sessions`") from error
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
 
 
 def command(folder: Path) -> list[str]:

@@ -108,6 +108,29 @@ def test_killed_between_a_drop_and_its_answer_the_session_is_whole(bench, runnin
     assert row["use"] == ("dropped" if dropped else "used")
 
 
+def test_a_session_is_gone_on_with_through_the_socket_and_replayed_as_one(loose, running, until, tmp_path):
+    with running(loose), Client(loose.config.socket, 60.0) as client:
+        session = one_pass(client, until)
+        client.request({"class": "STOP", "calibrate": True})
+        folder = loose.config.state_dir / "sessions" / session
+        first = yaml.safe_load((folder / CALIBRATION).read_text())
+        code, out, err = field(loose, "start", "--continue", "nothing")
+        assert (code, "no session nothing" in err) == (2, True)
+        code, out, err = field(loose, "start", "--continue", session)
+        assert (code, session in out) == (0, True), err
+        status = client.request({"class": "STATUS"})["lasers"][0]
+        assert (status["passes"], status["earlier_passes"]) == (1, 1)
+        until(lambda: client.request({"class": "STATUS"})["state"] == "collecting", 40.0)
+        client.request({"class": "STOP", "calibrate": True})
+        (row,) = client.request({"class": "SESSIONS"})["sessions"]
+        assert (row["session"], row["passes"]) == (session, 1)
+    both = yaml.safe_load((folder / CALIBRATION).read_text())
+    assert (first["captures"], both["captures"]) == (1, 2)
+    assert first["lasers"][0]["estimate"] == both["lasers"][0]["estimate"]
+    replay(folder, None, tmp_path / "again", None)
+    assert (tmp_path / "again" / CALIBRATION).read_bytes() == (folder / CALIBRATION).read_bytes()
+
+
 def test_pages_hold_as_much_as_a_reply_may(bench):
     """Five hundred sessions, asked page by page."""
     service = Service(bench.config)

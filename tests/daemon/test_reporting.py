@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -285,6 +286,21 @@ def test_a_dropped_pass_is_told_and_by_whom(copy, look):
     choice = {"laser": "front", "number": 4, "drop": True, "by": "ann", "at": "2026-11-22T04:00:00+00:00"}
     rewrite(folder / "calibration.yaml", lambda content: content.update(choices=[choice]))
     assert "not used: dropped by ann" in look(reporting.write(folder))["text"]
+
+
+def test_two_who_ask_for_one_report_write_it_one_after_the_other(tmp_path):
+    folder, through = tmp_path, threading.Event()
+
+    def other():
+        with reporting._alone(folder):
+            through.set()
+
+    with reporting._alone(folder):
+        asking = threading.Thread(target=other)
+        asking.start()
+        assert not through.wait(0.2)
+    assert through.wait(10.0)
+    asking.join()
 
 
 def test_a_folder_that_is_no_session_is_refused_with_a_hint(tmp_path, settings):
