@@ -93,6 +93,7 @@ class LaserChannel:
         self._seen_ns = 0
         self._laser, self._pole = laser, config.pole
         self._trajectory, self._gps_clock = trajectory, gps_clock
+        self._gps_resets = gps_clock.resets
         self._on_frame, self._on_scan = on_frame, on_scan
         count = round(laser.fov_deg / laser.resolution_deg) + 1
         self._bearing_rad = bearings_rad(count, laser.fov_deg, laser.resolution_deg)
@@ -167,10 +168,23 @@ class LaserChannel:
 
     def fuse(self) -> list[StoredPass]:
         """Place scans once a second of them waits; give the passes that have ended."""
+        if self._gps_resets != self._gps_clock.resets:
+            self._host_jumped()
         if self._waiting and self._seen_ns - self._waiting[0].stx_ns >= _TOGETHER_NS:
             self._place_next()
         oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns
         return self._closed(oldest_ns)
+
+    def _host_jumped(self) -> None:
+        """Learn the mirror's clock anew, as the receiver's had to be.
+
+        The host may have been suspended: its clock stood still meanwhile, and the revolutions that it missed
+        cannot be told from their number mod 256, which may look as though next to nothing had happened.
+        """
+        self._gps_resets = self._gps_clock.resets
+        self._clock, self._revolutions = Clock(max_drift=_MIRROR_DRIFT), None
+        self.dropped[NO_CLOCK] += sum(len(scan.range_m) for scan in self._waiting)
+        self._waiting.clear()
 
     def end(self) -> list[StoredPass]:
         """Place what can be placed and close what is open, at the end of a run."""

@@ -228,7 +228,7 @@ class Run:
             notes.append(f"nothing is recorded: {self._writer.full}; {MAKE_ROOM}")
         if self._space.over is not None:
             notes.append(self._space.over)
-        if names := [name for name, _ in self._unwritten]:
+        if self._write_again_s and (names := [name for name, _ in self._unwritten]):
             notes.append(f"for want of room not written: {', '.join(names)}; they are once there is room")
         return notes
 

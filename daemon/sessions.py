@@ -8,12 +8,13 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import structlog
 import yaml
 
 from polecal import PolecalError, __version__
@@ -29,6 +30,8 @@ CAPTURED_IN = "captured_in"
 CAPTURES = "capture*.mcap"
 """Matches all captures of a session's folder."""
 _LATER = "capture-{}.mcap"
+_STAMP = "%Y%m%dT%H%M%SZ"
+_STAMPED = re.compile(r"(\d{8}T\d{6}Z)-")
 _NUMBERED = re.compile(r"capture(?:-(\d+))?\.mcap")
 
 
@@ -121,7 +124,7 @@ def create(state_dir: Path, config: Config, name: str | None) -> Session:
     """Make a new session's folder. Raises SessionError."""
     now = datetime.now(UTC)
     label = name or "-".join(laser.name for laser in config.lasers)
-    folder = first = state_dir / "sessions" / f"{now:%Y%m%dT%H%M%SZ}-{label}"
+    folder = first = state_dir / "sessions" / f"{_stamp(state_dir / 'sessions', now)}-{label}"
     others = count(2)
     try:
         while folder.exists():  # one that was started, and failed, within the same second
@@ -135,6 +138,22 @@ def create(state_dir: Path, config: Config, name: str | None) -> Session:
     session = Session(folder, now.isoformat(timespec="seconds"))
     session.write_told(session.metadata(config))
     return session
+
+
+def _stamp(sessions: Path, now: datetime) -> str:
+    """Give the time that a new session is named after: now, or after all others if the clock was set back.
+
+    The last session is the one whose name is the last, also on a host that forgets the time when it is off.
+    """
+    there = (_STAMPED.match(path.name) for path in sessions.glob("*/"))
+    newest = max((match[1] for match in there if match), default="")
+    stamp = now.strftime(_STAMP)
+    if stamp >= newest:
+        return stamp
+    structlog.get_logger().warning(
+        "the host's clock is behind the last session's", now=stamp, last=newest, hint="set the clock"
+    )
+    return (datetime.strptime(newest, _STAMP) + timedelta(seconds=1)).strftime(_STAMP)
 
 
 def discard(session: Session) -> None:

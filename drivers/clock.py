@@ -39,12 +39,19 @@ class _Hull:
         self.y.append(y)
 
     def line(self, steepest: float) -> tuple[float, float]:
-        """Give slope and offset of the line through the edge over the middle, or no steeper below it."""
+        """Give slope and offset of the line through the edge over the middle, or no steeper below it.
+
+        Where first stamps were all late, that edge falls more than a clock can: then the next that does not.
+        """
         if len(self.x) < 2:
             return 0.0, float(self.y[0])
         edge = max(1, bisect_left(self.x, (self.x[0] + self.x[-1]) / 2))
-        (x0, x1), (y0, y1) = self.x[edge - 1 : edge + 1], self.y[edge - 1 : edge + 1]
-        slope = (y1 - y0) / (x1 - x0)
+        while True:
+            (x0, x1), (y0, y1) = self.x[edge - 1 : edge + 1], self.y[edge - 1 : edge + 1]
+            slope = (y1 - y0) / (x1 - x0)
+            if slope >= -steepest or edge == len(self.x) - 1:
+                break
+            edge += 1
         if abs(slope) <= steepest:  # of an edge of the hull all other points lie above its line
             return slope, min(y0 - slope * x0, y1 - slope * x1)
         slope = max(-steepest, min(steepest, slope))
@@ -80,14 +87,18 @@ class Clock:
         return self._old is not None and self._last_ns - self._first_ns >= self._settle_ns
 
     def update(self, device_ns: int, host_ns: int) -> None:
-        """Take one stamp, sent at ``device_ns`` and arrived at ``host_ns``; a jump of either starts anew."""
+        """Take one stamp, sent at ``device_ns`` and arrived at ``host_ns``; a jump of either starts anew.
+
+        So does, while the map is not `locked`, one that shows the first to have been far too late.
+        """
         if self._old is not None:
             late_ns = host_ns - self.to_host(device_ns)
             if device_ns <= self._last_ns + self._device0_ns:
                 if device_ns == self._last_ns + self._device0_ns:
                     return
                 late_ns = _JUMP_NS + 1  # time went back
-            if late_ns > _JUMP_NS or (late_ns < -_EARLY_NS and self.locked):
+            early_ns = -late_ns if self.locked else self._earlier_than_first_ns(device_ns, host_ns)
+            if late_ns > _JUMP_NS or early_ns > _EARLY_NS:
                 self.resets += 1
                 self._clear()
         if self._old is None or self._young is None:
@@ -103,6 +114,15 @@ class Clock:
         if x - self._first_ns >= self._half_ns:
             self._young.add(x, y)
         self._slope, self._offset_ns = self._old.line(self._max_drift)
+
+    def _earlier_than_first_ns(self, device_ns: int, host_ns: int) -> float:
+        """Say how much less late than the first stamp one is, beyond what drift can do.
+
+        What nobody read for seconds comes at once, the oldest the latest: of that nothing is to be learnt.
+        """
+        x = device_ns - self._device0_ns
+        y = host_ns - self._host0_ns - x
+        return -y - self._max_drift * x
 
     def to_host(self, device_ns: float) -> int:
         """Give the host's time at a device time, ns."""

@@ -90,10 +90,12 @@ class Device(ABC):
             self.state, self.problem = "streaming", None
             self._log.info("streaming", identity=self.identity, baud=port.baud)
             heard_s = time.monotonic()
-            while time.monotonic() - heard_s < self.silence_s:
+            while True:
                 chunk = port.read(_READ_S)
                 if chunk is not None and self._heard(chunk):
                     heard_s = time.monotonic()
+                elif time.monotonic() - heard_s >= self.silence_s:  # asked only once what waited was read
+                    break
             raise DeviceProtocolError(
                 f"{self.name} on {port.path}: no whole frame for {self.silence_s:.0f} s",
                 "check its power and cable; it is being set up again",

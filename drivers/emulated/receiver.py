@@ -50,6 +50,7 @@ _MARKS = {1: ("MARKTIME", "MARK1TIME"), 2: ("MARK2TIME",)}
 _FLIP = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # forward, right, down <-> right, forward, up
 _GRAVITY_MPS2 = np.array([0.0, 0.0, 9.80665])  # north, east, down
 _EARTH_RATE_RADPS = 7.292115e-5
+_METRES_A_DEGREE = 111e3  # of latitude
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +160,7 @@ class EmulatedReceiver(SpanPort):
         self._refused = frozenset(refused)
         self._block: _Block | None = None
         self._overrun_ns: int | None = None
+        self._outage: tuple[int, int, InsStatus] | None = None
         self.lost_logs = 0
         """Logs that did not fit into the port's buffer."""
         for message, period_s in also:
@@ -181,6 +183,12 @@ class EmulatedReceiver(SpanPort):
         said = replace(self._solution(self.gps_ms(t_ns)), mark=(week, round(ns, -1) / 1e9))  # to 10 ns
         self._happen(t_ns, [key for key in self._logs if key.name in _MARKS[number]], [said])
         self._send(t_ns, self.gps_ms(t_ns), [key for key, w in self._logs.items() if w.trigger == "ONMARK"])
+
+    def lose_solution(
+        self, t_ns: int, seconds: float, status: InsStatus = InsStatus.INS_SOLUTION_FREE
+    ) -> None:
+        """Have no good solution for a while from ``t_ns`` on: it drifts to the north by 1 m a second."""
+        self._outage = t_ns, t_ns + round(seconds * 1e9), status
 
     # --- commands
 
@@ -374,7 +382,7 @@ class EmulatedReceiver(SpanPort):
             sigma=solutions.GOOD_SIGMA,
         )
         if aligned_for_s >= self._complete_s:
-            return solution
+            return self._as_lost(solution, self.epoch_ns(epoch_ms))
         speed, course, _ = solution.course
         roll, pitch, azimuth = solution.attitude
         seed = course if speed > _COURSE_MPS else block.heading_deg[i]
@@ -385,6 +393,15 @@ class EmulatedReceiver(SpanPort):
             ins_status=InsStatus.INS_ALIGNMENT_COMPLETE,
             sigma=solutions.COMPLETE_SIGMA,
         )
+
+    def _as_lost(self, solution: Solution, t_ns: int) -> Solution:
+        if self._outage is None or not self._outage[0] <= t_ns < self._outage[1]:
+            return solution
+        begin_ns, _, status = self._outage
+        lat_deg, lon_deg, height_m = solution.position
+        off_deg = (t_ns - begin_ns) * 1e-9 / _METRES_A_DEGREE
+        position = (lat_deg + off_deg, lon_deg, height_m)
+        return replace(solution, position=position, ins_status=status, sigma=solutions.COMPLETE_SIGMA)
 
     def _moments(self, first_ms: int, step_ms: int, count: int) -> list[int]:
         """Return the host's moments of inertial solutions, which their headers' time is not."""

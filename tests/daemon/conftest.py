@@ -287,17 +287,24 @@ class Bench:
         return self.laser.mode == lms.Mode.REQUEST and self.laser.baud == 9600 and not self.receiver._logs
 
 
-@contextmanager
-def _bench(folder: Path) -> Iterator[Bench]:
-    """Devices that are aligned from the start, with nothing to write to an EEPROM, in a world of one pass.
-
-    The vehicle drives straight on and passes the pole 5 s after the laser's first scan.
-    """
-    now_ns = time.monotonic_ns()
+def _straight() -> World:
+    """A vehicle that drives straight on and passes the pole 5 s after the laser's first scan."""
     t = np.array([0.0, 1e3])
     way = np.column_stack([5.0 * t, np.zeros(2), np.full(2, -0.1)])
     straight = SampledTrajectory(t, way, np.zeros((2, 3)), np.tile([5.0, 0, 0], (2, 1)))
-    world = World(straight, mount=HAND_MEASURED, pole_ne_m=(24.0, 1.0))
+    return World(straight, mount=HAND_MEASURED, pole_ne_m=(24.0, 1.0))
+
+
+@contextmanager
+def _bench(
+    folder: Path, world: World | None = None, wire: Callable[[EmulatedDevice], Any] = lambda device: device
+) -> Iterator[Bench]:
+    """Devices that are aligned from the start, with nothing to write to an EEPROM, in a world of one pass.
+
+    ``wire`` makes of a device what is on its pseudo-terminal.
+    """
+    now_ns = time.monotonic_ns()
+    world = world or _straight()
     laser = EmulatedLaser(world, t0_ns=now_ns - 2 * 10**9, eeprom=lms.STREAM_CONFIG)
     receiver = EmulatedReceiver(world, t0_ns=now_ns, baud=230400, aligned_after_s=-2.0)
     content = {
@@ -307,11 +314,17 @@ def _bench(folder: Path) -> Iterator[Bench]:
         "navigation": {"port": str(folder / "span")},
         "pole": POLE,
     }
-    served = Served({folder / "lms": laser, folder / "span": receiver})
+    served = Served({folder / "lms": wire(laser), folder / "span": wire(receiver)})
     try:
         yield Bench(folder, world, laser, receiver, served, content)
     finally:
         served.close()
+
+
+@pytest.fixture(scope="session")
+def made_bench() -> Callable[..., Any]:
+    """Devices on pseudo-terminals in a folder, in a world and behind wires of one's own."""
+    return _bench
 
 
 @pytest.fixture

@@ -80,6 +80,32 @@ def test_a_device_that_counts_from_zero_again_is_learnt_anew():
     assert not clock.locked
 
 
+@pytest.mark.parametrize("period_ms", [10.0, 53.28])
+@pytest.mark.parametrize("held_s", [2.0, 5.0, 30.0])
+def test_of_what_nobody_read_for_seconds_and_comes_at_once_nothing_is_learnt(held_s, period_ms):
+    clock = Clock(max_drift=5e-3)
+    run(clock, seconds=20, latency_ms=lambda r: 0.0, ppm=0)
+    ended_ns = 20 * 10**9 + round(held_s * 1e9)
+    for index in range(1, round((held_s + 10) * 1e3 / period_ms)):
+        device_ns = 20 * 10**9 + round(index * period_ms * MS)
+        clock.update(device_ns, START_NS + max(device_ns, ended_ns))
+        if clock.locked and device_ns > ended_ns:
+            assert clock.to_host(device_ns) == pytest.approx(START_NS + device_ns, abs=MS)
+        elif clock.locked:  # it has not seen that anything is wrong, or all is late by little
+            assert clock.to_host(device_ns) == pytest.approx(START_NS + device_ns, abs=50 * MS)
+    assert clock.locked
+
+
+def test_first_stamps_that_are_all_late_do_not_tilt_the_clock():
+    clock = Clock(max_drift=5e-3)
+    for index in range(1000):
+        device_ns = index * 10 * MS
+        late_ns = max(0, 40 * MS - index * MS // 4)  # over after 1.6 s
+        clock.update(device_ns, START_NS + device_ns + late_ns)
+        if clock.locked:
+            assert clock.to_host(device_ns) == pytest.approx(START_NS + device_ns, abs=MS)
+
+
 def test_the_same_device_time_twice_changes_nothing():
     clock = Clock(max_drift=5e-3)
     run(clock, seconds=20, latency_ms=lambda r: 0.0)
