@@ -121,6 +121,7 @@ class Port:
         Raises Stopped, DeviceLost.
         """
         deadline_s = time.monotonic() + timeout_s
+        empty = False
         while True:
             self._beat()
             if self.stop.is_set():
@@ -137,7 +138,10 @@ class Port:
             if data:
                 self._tap("rx", t_ns, data)
                 return Chunk(t_ns, data)
-            if ready:  # readable, and nothing there: hung up
+            if ready and not empty:  # somebody else may have read it
+                empty = True
+                continue
+            if ready:  # readable again, and again nothing there: hung up
                 raise self._lost(OSError(errno.EIO, os.strerror(errno.EIO)))
             if left_s <= _WAIT_S:
                 return None

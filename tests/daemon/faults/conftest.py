@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +29,7 @@ from polecal.drivers.emulated.line import EmulatedDevice
 from polecal.drivers.emulated.world import World, demo_world
 from polecal.drivers.novatel_span import Framer as SpanFramer
 from polecal.drivers.novatel_span import nav_state
-from polecal.drivers.sick_lms import REVOLUTION_S
+from polecal.drivers.sick_lms import REVOLUTION_S, Scan
 from polecal.drivers.sick_lms import Framer as LaserFramer
 
 WITHIN_S = 10.0
@@ -53,7 +54,7 @@ class _Faster:
 
 
 def _world() -> World:
-    """The demonstration's world at 7 m/s, a pass in 3 s; navigation is exact, and nothing but the pole shines."""
+    """The demonstration's world at 7 m/s, a pass in 3 s; with exact navigation, and no plate."""
     world = demo_world(1)
     world.trajectory, world.nav_error, world.reflectors = _Faster(world.trajectory), None, ()
     return world
@@ -175,6 +176,7 @@ class Trial:
         self.seen = Seen()
         self.recovery_s = self.worst_m = 0.0
         self.result: dict[str, Any] = {}
+        self._bad_before: dict[str, int] = {}
         self._wait(self.passes, 25.0)
 
     @property
@@ -223,6 +225,7 @@ class Trial:
     def fault(self, seconds: float = 0.0) -> Iterator[Seen]:
         """Have what is done within it be the fault, for so long; then wait until all is well again."""
         self.seen = Seen()
+        self._bad_before = {device["name"]: device["bad_frames"] for device in self.status()["devices"]}
         end_s = time.monotonic() + seconds
         yield self.seen
         while time.monotonic() < end_s:
@@ -245,10 +248,10 @@ class Trial:
         self._wait(well, WITHIN_S)
         self.recovery_s = time.monotonic() - over_s
 
-    def goes_on(self, passes: int = 2) -> None:
-        """Wait for more passes, end the session with what there is, and hold its passes against the truth."""
+    def goes_on(self) -> None:
+        """Wait for one more pass, end the session with what there is, and hold all of it against the truth."""
         so_far = self.passes()
-        self._wait(lambda: self.passes() >= so_far + passes, 20.0)
+        self._wait(lambda: self.passes() > so_far, 20.0)
         last = self.status()
         assert last["state"] == "collecting", last
         assert self.seen.slowest_s < 1.0
@@ -302,15 +305,26 @@ class Trial:
         return (max(times_ms) - min(times_ms)) // 10 + 1 - len(times_ms)
 
     def lost_scans(self) -> int:
-        """How many scans are missing between the first and the last that came, by their stamps."""
-        stamps = [frame.t_first_ns for frame in self._frames("front") if frame.command == SCAN]
-        return round((stamps[-1] - stamps[0]) / SCAN_NS) + 1 - len(stamps)
+        """How many scans are missing between the first and the last that came.
+
+        By the numbers of their revolutions, mod 256; over a longer gap by their stamps.
+        """
+        scans = [
+            (frame.t_first_ns, Scan.parse(frame).scan_index)
+            for frame in self._frames("front")
+            if frame.command == SCAN
+        ]
+        lost = 0
+        for (before_ns, before), (t_ns, turn) in pairwise(scans):
+            gap = (t_ns - before_ns) / SCAN_NS
+            lost += (round(gap) if gap > 32 else (turn - before) % 256 // 4) - 1
+        return lost
 
     def untouched(self, name: str) -> None:
         """Say that what happened has cost a device's stream nothing: not a frame, not a byte."""
         device = self.device(name)
         assert device["reconnects"] == 0
-        assert device["bad_frames"] == 0
+        assert device["bad_frames"] == self._bad_before[name]
         assert (self.lost_poses() if name == SPAN else self.lost_scans()) == 0
 
     def line(self, fault: str) -> str:
