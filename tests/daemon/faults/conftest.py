@@ -249,7 +249,7 @@ class Trial:
         self.recovery_s = time.monotonic() - over_s
 
     def goes_on(self) -> None:
-        """Wait for one more pass, end the session with what there is, and hold all of it against the truth."""
+        """Wait for one more pass, end the session, and hold all that it gave against the truth."""
         so_far = self.passes()
         self._wait(lambda: self.passes() > so_far, 20.0)
         last = self.status()

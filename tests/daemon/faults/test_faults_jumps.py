@@ -1,4 +1,4 @@
-"""A host's clock that stood still while devices went on, and bytes that waited for seconds: in virtual time."""
+"""A clock that stood still while devices went on, and bytes that waited for seconds: in virtual time."""
 
 import numpy as np
 import pytest
