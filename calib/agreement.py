@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from polecal.calib.estimate import Pass, Result, Setup
 from polecal.calib.geometry import Array, wrap
@@ -127,7 +127,7 @@ def _allowed(apart_m: Array, scatter: Array, moved: Sequence[Array], views: Sequ
     for of, view in zip(moved, views, strict=True):
         allowed += of @ view.covariance @ of.T
     square = float(apart_m @ np.linalg.solve(allowed, apart_m))
-    most = float(chi2.isf(_FALSE_ALARMS, 2))
+    most = float(chdtri(2, _FALSE_ALARMS))
     if square <= most:
         return ""
     return f"their σ allow {np.linalg.norm(apart_m) * np.sqrt(most / square):.3f} m"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from polecal.calib.acceptance import Jump
 from polecal.calib.geometry import Array, wrap
@@ -49,7 +49,7 @@ def jump(left_out: Array) -> Jump | None:
     spread[:, 3:6] = wrap(spread[:, 3:6])
     say = (1 - passes) * (spread - spread.mean(axis=0))
     splits = range(_FEWEST_BEFORE, passes)
-    most = student_t.isf(_FALSE_ALARMS / 2 / len(splits) / len(PARAMETERS), passes - 2)
+    most = -stdtrit(passes - 2, _FALSE_ALARMS / 2 / len(splits) / len(PARAMETERS))
     found, worst = None, float(most)
     for split in splits:
         before, after = say[:split], say[split:]
