@@ -489,19 +489,33 @@ def test_what_a_device_says_is_text_and_no_markup(serve, look):
 
 
 def test_a_verdict_is_told_in_words_and_colours(serve, look, driven):
-    told = {"accepted": (True, []), "rejected": (False, ["front: √c is 0.2 m, over 0.05 m"])}
-    colours = {}
-    for state, (accepted, reasons) in told.items():
+    met, not_met = (True, []), (False, ["√c is 0.2 m, over 0.05 m"])
+    cases = {
+        "accepted": [(met, "✓ accepted", "rgb(0, 96, 15)")],
+        "rejected": [
+            (not_met, "✗ rejected", "rgba(0, 0, 0, 0)"),
+            (met, "its criteria are met; the session is rejected", "rgba(0, 0, 0, 0)"),
+        ],
+        "collecting": [(not_met, "not yet", "rgba(0, 0, 0, 0)")],
+    }
+    for state, lasers in cases.items():
         status = json.loads(json.dumps(driven({"class": "STATUS"}))) | {"state": state}
-        status["lasers"][0]["verdict"] = {"accepted": accepted, "reasons": reasons}
+        status["lasers"] = [
+            status["lasers"][0] | {"name": str(name), "verdict": {"accepted": accepted, "reasons": reasons}}
+            for name, ((accepted, reasons), _, _) in enumerate(lasers)
+        ]
         with serve(telling(status)) as port:
             shown = look(port)
-            verdict = shown.locator(".verdict")
-            assert state in verdict.inner_text()
-            assert all(reason in verdict.inner_text() for reason in reasons)
-            colours[state] = verdict.evaluate("e => getComputedStyle(e).backgroundColor")
+            for verdict, ((_, reasons), words, colour) in zip(
+                shown.locator(".verdict").all(), lasers, strict=True
+            ):
+                assert verdict.inner_text().split("\n")[0] == words
+                assert all(reason in verdict.inner_text() for reason in reasons)
+                assert verdict.evaluate("e => getComputedStyle(e).backgroundColor") == colour
+            assert not any(
+                canvas.is_visible() for canvas in shown.locator("canvas").all()
+            )  # no pass, no cloud
             shown.context.close()
-    assert colours["accepted"] != colours["rejected"]
 
 
 def test_a_daemon_that_goes_away_is_missed_and_found_again(bench, running, look):
