@@ -125,7 +125,7 @@ def image(cgroup2):
     roomy = memory.is_dir() and shutil.disk_usage(memory).free > _ROOM_BYTES
     made = Image(Path(tempfile.mkdtemp(prefix="polecal-machine-", dir=memory if roomy else None)))
     made.folder.chmod(0o755)
-    (command,) = re.findall(r"^    sudo (systemd/install)$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    (command,) = re.findall(r"^sudo (systemd/install)$", (ROOT / "README.md").read_text(), re.MULTILINE)
     try:
         done = made.run("none", "true", lower="/")
         if done.returncode:
