@@ -552,6 +552,26 @@ def test_a_session_is_followed_live_from_its_start(bench, running, look):
         shown.context.close()
 
 
+def test_clouds_that_take_long_are_no_sign_of_a_lost_daemon(serve, look, driven):
+    asked, done = threading.Semaphore(0), threading.Event()
+
+    def slow(request):
+        if request["class"] == "PASSES":
+            asked.release()
+            done.wait(30.0)
+        return driven(request)
+
+    with serve(slow) as port:
+        shown = look(port)
+        assert asked.acquire(timeout=15.0)
+        shown.wait_for_timeout(5500)  # longer than the page waits for an answer
+        assert not shown.is_visible("#lost")
+        assert shown.get_attribute("body", "data-clouds") is None
+        done.set()
+        shown.wait_for_selector("body[data-clouds]", timeout=20000)
+        shown.context.close()
+
+
 def test_a_page_that_cannot_show_what_it_is_told_says_so(serve, look):
     with serve(telling(IDLE | {"lasers": [{"name": "front"}]})) as port:
         shown = look(port, troubles_expected=True)
