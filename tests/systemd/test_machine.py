@@ -1,5 +1,7 @@
 """polecal as a service under a real systemd: started, watched, killed, reloaded, stopped, and at work."""
 
+import json
+import re
 import time
 
 import pytest
@@ -226,3 +228,28 @@ def test_the_installed_files_are_the_projects_and_the_service_starts_at_boot(ima
     modules = done.stdout.splitlines()[len(CHANGED) + 2 :]
     assert "./daemon/service.py" in modules
     assert len(modules) > 50
+
+
+ASK = """
+import http.client
+line = http.client.HTTPConnection("127.0.0.1", 8291, timeout=5)
+line.request("GET", "/status")
+print(line.getresponse().read().decode())
+"""
+
+
+def test_the_page_takes_its_drop_in_and_is_then_there_for_this_machine(polecal, until):
+    polecal.configure(page={"listen": "127.0.0.1:8291"})
+    polecal.systemctl("start", "polecal")
+    until(lambda: "no page yet" in polecal.journal)
+    assert "page.conf" in polecal.journal
+    assert polecal.ask("STATUS")["state"] == "idle"  # which is no reason not to work
+    said = polecal.path("/opt/polecal/page.conf").read_text()
+    (install,) = re.findall(r"^#\s+install (-D .*)$", said, re.MULTILINE)
+    polecal.run("install", *install.replace("/etc/", "/run/").split())
+    polecal.systemctl("daemon-reload")
+    polecal.mark()
+    polecal.systemctl("restart", "polecal")
+    until(lambda: "listen=127.0.0.1:8291" in polecal.journal)
+    assert "no page yet" not in polecal.journal
+    assert json.loads(polecal.run("python3", "-c", ASK).stdout)["state"] == "idle"
