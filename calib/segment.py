@@ -152,5 +152,7 @@ def even_ground(range_m: Array, bearing_rad: Array, down_m: Array) -> NDArray[np
         residual = down_m - flat @ plane
         residual -= np.median(residual[kept])
         spread_m = 1.4826 * float(np.median(np.abs(residual[kept])))
-        kept = np.abs(residual) <= max(_TRIM_SIGMAS * spread_m, _EVEN_M)
+        before, kept = kept, np.abs(residual) <= max(_TRIM_SIGMAS * spread_m, _EVEN_M)
+        if np.array_equal(kept, before):
+            break
     return kept

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +119,8 @@ class PassBuilder:
             self._count += 1
             kept = _even(returns, mount)
             self.uneven += int(np.count_nonzero(~kept))
-            gps_ns, returns = gps_ns[kept], returns[kept]
+            if not kept.all():
+                gps_ns, returns = gps_ns[kept], returns[kept]
             closed.append(
                 StoredPass(
                     id=self._count,
@@ -140,9 +141,9 @@ class PassBuilder:
 
 def _even(returns: Returns, mount: Mount) -> NDArray[np.bool_]:
     kept = np.ones(len(returns), dtype=bool)
-    ground = returns.kind == Kind.GROUND
-    part = returns[ground]
-    kept[ground] = even_ground(part.range_m, part.bearing_rad, points_nav(part, mount)[:, 2])
+    ground = np.flatnonzero(returns.kind == Kind.GROUND)
+    down_m = points_nav(returns, mount)[ground, 2]
+    kept[ground] = even_ground(returns.range_m[ground], returns.bearing_rad[ground], down_m)
     return kept
 
 
@@ -167,5 +168,6 @@ def observed(
 def joined(parts: list[Returns], pass_id: int) -> Returns:
     """Put returns of one pass behind one another."""
     known = [one.name for one in fields(Returns) if getattr(parts[0], one.name) is not None]
-    whole = Returns(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in known})
-    return replace(whole, pass_id=np.full(len(whole), pass_id, dtype=np.int64))
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in known}
+    whole["pass_id"] = np.full(len(whole["range_m"]), pass_id, dtype=np.int64)
+    return Returns(**whole)

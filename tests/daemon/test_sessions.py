@@ -2,6 +2,7 @@
 
 import errno
 import os
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -125,6 +126,8 @@ def test_where_none_was_accepted_it_says_so(tmp_path, name):
 def test_a_stored_pass_has_its_times_returns_and_moments(recorded):
     files = sorted((recorded.session.folder / "passes").iterdir())
     stored = [one for _, one in recorded.played.passes]
+    plain_bytes = sum(getattr(stored[0].returns, part.name).nbytes for part in fields(stored[0].returns))
+    assert files[0].stat().st_size < 0.6 * plain_bytes
     assert [file.name for file in files] == [f"front-{one.id:03d}.npz" for one in stored]
     with np.load(files[0], allow_pickle=False) as file:
         one = stored[0]
