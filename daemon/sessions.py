@@ -118,7 +118,7 @@ _WORTH_IT = 0.5  # of its size: poses and moments are all digits, which costs mu
 
 def _save(file: IO[bytes], arrays: dict[str, Any]) -> None:
     """Write what `np.savez_compressed` does, but compressed only where that halves it."""
-    with zipfile.ZipFile(file, "w", compresslevel=1) as archive:
+    with zipfile.ZipFile(file, "w") as archive:
         for name, value in arrays.items():
             column = BytesIO()
             np.lib.format.write_array(column, np.asarray(value), allow_pickle=False)
@@ -126,7 +126,7 @@ def _save(file: IO[bytes], arrays: dict[str, Any]) -> None:
             sample = content[len(content) // 2 :][:_SAMPLE_BYTES]
             worth_it = len(zlib.compress(sample, 1)) < _WORTH_IT * len(sample)
             method = zipfile.ZIP_DEFLATED if worth_it else zipfile.ZIP_STORED
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content, method)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content, method, compresslevel=1)
 
 
 def _plain(value: str | float | None) -> str | float:
