@@ -5,6 +5,10 @@ Euler order yaw, pitch, roll: ``C = Rz(yaw) Ry(pitch) Rx(roll)``, from the turne
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,14 +17,21 @@ Array = NDArray[np.float64]
 
 def rotation(rpy_rad: Array) -> Array:
     """Give C = Rz(yaw) Ry(pitch) Rx(roll), (..., 3, 3), of (..., 3) roll, pitch, yaw in rad."""
+    if rpy_rad.ndim == 1:  # each solution asks a thousand times for one: a quarter of the time
+        angles = rpy_rad.tolist()
+        return np.array(_entries(map(math.cos, angles), map(math.sin, angles))).reshape(3, 3)
     return _matrices(rotation_entries(rpy_rad))
 
 
 def rotation_entries(rpy_rad: Array) -> tuple[Array, ...]:
     """Give the nine entries (...) of `rotation`, row by row, each an array of its own."""
-    c, s = np.cos(rpy_rad), np.sin(rpy_rad)
-    cr, cp, cy = c[..., 0], c[..., 1], c[..., 2]
-    sr, sp, sy = s[..., 0], s[..., 1], s[..., 2]
+    return _entries(np.moveaxis(np.cos(rpy_rad), -1, 0), np.moveaxis(np.sin(rpy_rad), -1, 0))
+
+
+def _entries(cosines: Iterable[Any], sines: Iterable[Any]) -> tuple[Any, ...]:
+    """Give `rotation_entries` of the cosines and sines of roll, pitch and yaw: numbers, or arrays."""
+    cr, cp, cy = cosines
+    sr, sp, sy = sines
     return (
         *(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
         *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
