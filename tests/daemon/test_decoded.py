@@ -411,7 +411,7 @@ def test_where_the_disk_has_room_only_for_what_was_recorded_the_rest_is_left_out
     recorded, small_disk, tmp_path
 ):
     """5.4 MB and 4 MB of it compressed; with all else it would be 13 MB."""
-    folder = small_disk("14m")
+    folder = small_disk("13m")
     path = copied(recorded, folder / "session")
     done = finalise(path, 2_000_000)
     assert done.not_decoded == "too little room on the disk"
