@@ -108,6 +108,7 @@ def past_of(folder: Path) -> Past:
             choices=tuple(Choice.from_dict(each) for each in content.get("choices", [])),
             ended=State(content["state"]),
             reference_point=content["lasers"][0].get("reference_point"),
+            origin=_origin(content),
         )
     choices, earlier_poles = _recorded(captures[-1]) if captures else ((), {})
     site = len(captures) - 1
@@ -155,6 +156,11 @@ def read_pass(path: Path) -> Kept:
             return Kept(int(file["place"]), (first_ns, last_ns), Pass(number, blocks, site), about, quality)
     except _DAMAGE as error:
         raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
+
+
+def _origin(content: dict[str, Any]) -> tuple[float, float, float] | None:
+    origin = content.get("origin")
+    return None if origin is None else (origin["lat_deg"], origin["lon_deg"], origin["height_m"])
 
 
 _REPLAY = "make it anew from the capture: `polecal-field replay`"

@@ -34,8 +34,20 @@ Message = dict[str, Any]
 PROTO = (1, 0)
 GROUP = "polecal"
 MAX_LINE_BYTES = 64 * 1024
-REQUESTS = ("START", "STATUS", "WATCH", "STOP", "RESULT", "PASSES", "DROP", "KEEP", "SESSIONS", "REPORT")
-LOOKING = frozenset({"STATUS", "WATCH", "RESULT", "PASSES", "SESSIONS"})
+REQUESTS = (
+    "START",
+    "STATUS",
+    "WATCH",
+    "STOP",
+    "RESULT",
+    "PASSES",
+    "DROP",
+    "KEEP",
+    "SESSIONS",
+    "REPORT",
+    "ROUTE",
+)
+LOOKING = frozenset({"STATUS", "WATCH", "RESULT", "PASSES", "SESSIONS", "ROUTE"})
 """What whoever may connect may ask; the rest is for root, the daemon's own user and the group."""
 
 _WATCH_S = 1.0

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import os
+import re
 import sys
 import tempfile
 import threading
@@ -42,6 +43,7 @@ _SEE_STATUS = "see `polecal-field status`"
 _DECODE_BYTES = 4096
 COMPLETED = ("bash", "zsh", "fish", "sessions", "passes")
 _FORMATS = ("yaml", "json", "urdf", "ros2", "autoware", "snark", "libbot")
+_ROUTES = ("geojson", "gpx", "csv")
 _EXIT_BY_STATE = {State.ACCEPTED: 0, State.REJECTED: Code.REJECTED, State.FAULT: Code.DEVICE}
 _WORKING = (State.CONNECTING, State.ALIGNING, State.COLLECTING)
 
@@ -137,6 +139,22 @@ def make_parser() -> argparse.ArgumentParser:
         chosen.add_argument("name", metavar="PASS", help="like 7, or like front-007")
         chosen.add_argument("--session", metavar="SESSION", help="by default the present or last one")
     verb(_sessions, "list the sessions")
+    routed = verb(_route, "print the drive that fills what is missing, around the pole")
+    routed._negative_number_matcher = re.compile(r"-\.?\d")  # -33.9,151.2 is a place and no option
+    routed.add_argument("session", nargs="?", metavar="SESSION", help="by default the present or last one")
+    routed.add_argument("--format", choices=_ROUTES, help="for which program; else in words")
+    routed.add_argument("--out", type=Path, metavar="FILE", help="into it; its ending says which format")
+    place = "where the pole is, degrees; until it was seen"
+    routed.add_argument("--pole", type=_numbers, metavar="LAT,LON", help=place)
+    lengths = {
+        "--half-width": ("half_width_m", "half of the vehicle's width, else 0.6"),
+        "--radius": ("turn_radius_m", "of its turns, else 5"),
+        "--area": ("area_m", "how far from the pole it may go, else 20"),
+    }
+    for option, (name, about) in lengths.items():
+        routed.add_argument(option, dest=name, type=float, metavar="M", help=about)
+    speeds = "fast and slow, m/s, else 3,1.5"
+    routed.add_argument("--speeds", dest="speeds_mps", type=_numbers, metavar="V,V", help=speeds)
     replay = verb(_replay, "run a capture through the whole pipeline again, without a daemon")
     replay.add_argument("capture", type=Path, metavar="CAPTURE", help="its file, or its session's folder")
     replay.add_argument("--config", type=Path, metavar="FILE", help="instead of the capture's own")
@@ -368,6 +386,28 @@ def _whole(arguments: argparse.Namespace, request: dict[str, Any], rows: str) ->
             more = client.request(request | {"from": answer["next"]})
             answer = answer | {rows: [*answer[rows], *more[rows]], "next": more["next"]}
     return answer
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(part) for part in text.split(",")]
+
+
+def _route(arguments: argparse.Namespace) -> int:
+    from polecal.daemon import routefile  # noqa: PLC0415
+
+    asked = ("session", "pole", "half_width_m", "turn_radius_m", "area_m", "speeds_mps")
+    with Client(arguments.socket, _LIST_S) as client:
+        route = client.request({"class": "ROUTE"} | {name: getattr(arguments, name) for name in asked})
+    ending = arguments.out.suffix[1:] if arguments.out else ""
+    form = arguments.format or (ending if ending in _ROUTES else "geojson" if arguments.out else None)
+    if form is not None and (arguments.out or not arguments.json):
+        text = routefile.FORMATS[form](route)
+        if arguments.out is None:
+            print(text, end="")
+            return 0
+        arguments.out.write_text(text, encoding="utf-8")
+    _tell(route, arguments, routefile.words)
+    return 0
 
 
 def _drop(arguments: argparse.Namespace) -> int:

@@ -18,7 +18,8 @@ Where = tuple[int, int]
 class Past:
     """All that a session's next day starts from; ``passes`` and ``poles`` by laser, ``site`` is the next.
 
-    ``ended`` and ``reference_point`` are of a session whose last day was calibrated.
+    ``ended``, ``reference_point`` and ``origin`` (of n: degrees, m) are of a session whose last day was
+    calibrated.
     """
 
     site: int
@@ -27,6 +28,7 @@ class Past:
     choices: tuple[Choice, ...] = ()
     ended: State | None = None
     reference_point: Any = None
+    origin: tuple[float, float, float] | None = None
 
     def as_event(self) -> dict[str, Any]:
         """Write which it is, as the capture of the next day says it: the passes by their numbers alone."""

@@ -28,6 +28,7 @@ from polecal.daemon.navigation import Navigation, OnPose, name_of
 from polecal.daemon.passes import Kept, StoredPass
 from polecal.daemon.past import Past
 from polecal.daemon.pulse import Pulse
+from polecal.daemon.route import LaserStand, Place, Stand
 from polecal.daemon.routine import OnTransition, Routine, State
 from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
@@ -172,7 +173,8 @@ class Pipeline:
         self._on_pose = on_pose
         self._site = 0
         self._choices: list[Choice] = []
-        self._reference_point: Any = None  # of a session that was reopened
+        self._reference_point: Any = None  # of a session that was reopened, as the next
+        self._origin: Place | None = None
         self._navigation = Navigation(config.navigation, on_pose)
         self._lasers = {
             laser.name: _LaserRun(config, laser, self._navigation.trajectory, self._navigation.clock, on_scan)
@@ -194,7 +196,7 @@ class Pipeline:
 
     def remember(self, past: Past) -> None:
         """Take over what is known of earlier days, in place of all that is known so far."""
-        self._site, self._reference_point = past.site, None
+        self._site, self._reference_point, self._origin = past.site, None, None
         self._navigation = Navigation(self._config.navigation, self._on_pose)
         for name, laser in self._lasers.items():
             laser.remember(past.passes.get(name, []), past.poles.get(name, []))
@@ -222,7 +224,7 @@ class Pipeline:
             laser.estimate(everywhere=True)
         self._compare()
         if past.ended is not None:
-            self._reference_point = past.reference_point
+            self._reference_point, self._origin = past.reference_point, past.origin
             self.routine.reopen(past.ended, t_ns)
 
     def feed(self, device: str, t_ns: int, data: bytes) -> None:
@@ -301,6 +303,29 @@ class Pipeline:
         clock = self._navigation.clock
         return clock.to_device(t_ns) if clock.locked else None
 
+    def stand(self) -> Stand:
+        """Give what a route depends on."""
+        lasers = []
+        for laser in self._lasers.values():
+            poles = laser.poles()
+            kept = [one for one in laser.passes if one.where in poles and one.id not in laser.dropped]
+            today = [one.moments for one in kept if one.moments.site == self._site]
+            passes = [one.moments for one in kept]
+            lasers.append(LaserStand(laser.name, laser.setup, laser.result, passes, today))
+        pose = self._navigation.trajectory.newest
+        return Stand(
+            state=self.routine.state,
+            next=self._next(),
+            missing=self._missing(),
+            lasers=lasers,
+            origin=self._navigation.trajectory.origin or self._origin,
+            here=None if pose is None else ((pose.lat_deg, pose.lon_deg, pose.height_m), pose.azimuth_deg),
+        )
+
+    def _origin_told(self) -> dict[str, float] | None:
+        origin = self._navigation.trajectory.origin or self._origin
+        return origin and dict(zip(("lat_deg", "lon_deg", "height_m"), origin, strict=True))
+
     def calibration(self) -> dict[str, Any] | None:
         """Give the content of ``calibration.yaml``, None before there is a result for every laser."""
         lasers = []
@@ -316,6 +341,7 @@ class Pipeline:
             "state": str(self.routine.state),
             "lasers": lasers,
             "captures": self._site + 1,
+            "origin": self._origin_told(),
             "choices": [choice.as_dict() for choice in self._choices],
         }
 
@@ -473,12 +499,7 @@ class Pipeline:
             case State.ALIGNING:
                 return "drive until the navigation has aligned: straight, briskly, with a few turns"
             case State.COLLECTING:
-                missing = {
-                    part["slice"]
-                    for laser in self._lasers.values()
-                    for part in results.entry(laser.name, laser.setup, laser.result)["coverage"]
-                    if not part["done"]
-                }
+                missing = self._missing()
                 every, width = set(range(360 // self._need.slice_deg)), self._need.slice_deg
                 if missing == every:
                     return "drive past the pole, within 7 m of it, from any side"
@@ -490,6 +511,14 @@ class Pipeline:
                 return "drive more passes of the pole, from all sides" + self._to_know_more()
             case _:
                 return ""
+
+    def _missing(self) -> frozenset[int]:
+        return frozenset(
+            part["slice"]
+            for laser in self._lasers.values()
+            for part in results.entry(laser.name, laser.setup, laser.result)["coverage"]
+            if not part["done"]
+        )
 
     def _to_know_more(self) -> str:
         """Say what would make better known what is not known well enough, if that is all that is missing."""

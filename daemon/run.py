@@ -22,6 +22,7 @@ from polecal.daemon.past import Past
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import FULL, DiskFull, Event, Record, Recorder, RecorderError
 from polecal.daemon.replay import BEGIN, CHOICE, FINISH, play
+from polecal.daemon.route import Stand
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.sessions import CALIBRATION, Session, SessionError
 from polecal.daemon.space import MAKE_ROOM, Space
@@ -164,6 +165,11 @@ class Run:
         """Give a row a pass."""
         with self._lock:
             return self._pipeline.passes()
+
+    def stand(self) -> Stand:
+        """Give what a route depends on."""
+        with self._lock:
+            return self._pipeline.stand()
 
     def choose(self, said: object, *, drop: bool, by: str, at: str) -> dict[str, Any]:
         """Drop or keep a pass, also after the end; give what changed.

@@ -19,11 +19,12 @@ from typing import Any
 import structlog
 
 from polecal import PolecalError, __version__
-from polecal.daemon import archive, log, reporting, sessions, shelf
+from polecal.daemon import archive, log, reporting, route, sessions, shelf
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, asker, code_of
 from polecal.daemon.finalise import Finaliser
 from polecal.daemon.notify import Manager, summary
+from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.run import Run, joined, silent
 from polecal.daemon.space import Space
@@ -75,6 +76,8 @@ class Service:
                 return self._choose(request, drop=request["class"] == "DROP")
             case "SESSIONS":
                 return self._sessions(request.get("from", 0))
+            case "ROUTE":
+                return self._route(request)
             case other:
                 raise Refused(
                     f"{other!r} is not a request that this daemon knows", "see README.md", Code.USAGE
@@ -245,6 +248,20 @@ class Service:
         run = self._run
         running = (run.session.id, str(run.state)) if run is not None and not run.ended.is_set() else None
         return {"class": "SESSIONS"} | _page("sessions", shelf.rows(self._config.state_dir, running), first)
+
+    def _route(self, request: dict[str, Any]) -> dict[str, Any]:
+        session = request.get("session")
+        run = self._run_of(session)
+        config, name = self._config, session
+        if run is not None:
+            name, stand = run.session.id, run.stand()
+        elif session is None and not any((self._config.state_dir / "sessions").glob("*/")):
+            stand = Pipeline(config).stand()  # nothing was driven yet
+        else:
+            folder = archive.find(self._config.state_dir, self._named(session))
+            name, config = folder.name, archive.told(folder)[1]
+            stand = archive.reopen(folder)[1].stand()
+        return {"session": name} | route.answer(config, stand, request)
 
     def _run_of(self, session: str | None) -> Run | None:
         """Give the present run, or the last one's, if that is the session which is meant."""

@@ -43,6 +43,8 @@ class Trajectory:
         """Latitude, longitude (degrees) and ellipsoidal height (m) of n's origin."""
         self._gap_ns = int(_LONGEST_GAP * period_s * 1e9)
         self._last_ns, self._last_yaw_rad = 0, 0.0
+        self.newest: NavState | None = None
+        """The last pose that was taken."""
         self._new: list[tuple[float, ...]] = []  # latitude, longitude, height; roll, pitch, yaw: not in n yet
         self._new_ns: list[int] = []
         self._count = 0
@@ -63,6 +65,7 @@ class Trajectory:
         if pose.gps_ns <= self._last_ns:
             return
         # yaw goes on where it was, so that it can be interpolated across north
+        self.newest = pose
         turned_rad = (yaw_rad - self._last_yaw_rad + math.pi) % (2 * math.pi) - math.pi
         self._last_ns, self._last_yaw_rad = pose.gps_ns, self._last_yaw_rad + turned_rad
         angles_rad = math.radians(pose.roll_deg), math.radians(pose.pitch_deg), self._last_yaw_rad

@@ -75,6 +75,46 @@ class _Path:
     pole_m: Floats  # (passes,) metres along, nearest to the pole
 
 
+class Uneven:
+    """Gently uneven ground: roll and pitch up to 2.5° and the height by 3 cm are functions of the place.
+
+    ``clearance_m`` is the height of the body's origin above the mean ground, which is at down = 0.
+    """
+
+    def __init__(self, rng: np.random.Generator, clearance_m: float = 0.1) -> None:
+        self._height_m = -clearance_m
+        wavelength_m = rng.uniform(5.0, 12.0, (3, 3))
+        bearing_rad = rng.uniform(0, 2 * np.pi, (3, 3))
+        self._wave_k = (
+            2
+            * np.pi
+            / wavelength_m[..., None]
+            * np.stack([np.cos(bearing_rad), np.sin(bearing_rad)], axis=-1)
+        )  # (3 fields, 3 waves, 2)
+        self._wave_phase = rng.uniform(0, 2 * np.pi, (3, 3))
+        shares = np.array([0.5, 0.3, 0.2])
+        # Two slopes whose largest sum is 2.5°, and a height
+        self._wave_size = np.outer([np.deg2rad(1.75), np.deg2rad(1.75), 0.03], shares)
+
+    def body(self, north: Floats, east: Floats, yaw: Floats, speed: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the pose and velocity, as `Trajectory` says, of a body at (N,) places in m.
+
+        ``speed`` (N,) m/s is along its heading ``yaw`` (N,) rad.
+        """
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        phase = (
+            np.multiply.outer(north, self._wave_k[..., 0]) + np.multiply.outer(east, self._wave_k[..., 1])
+        ) + self._wave_phase
+        slope_n, slope_e, height = np.sum(self._wave_size * np.sin(phase), axis=-1).T
+        rate = (self._wave_size * np.cos(phase))[:, 2]  # d height / d phase, of each wave
+        climb = speed * np.sum(
+            rate * (np.outer(cos, self._wave_k[2, :, 0]) + np.outer(sin, self._wave_k[2, :, 1])), axis=-1
+        )
+        position = np.column_stack([north, east, self._height_m - height])
+        rpy = np.column_stack([slope_n * sin - slope_e * cos, slope_n * cos + slope_e * sin, yaw])
+        return position, rpy, np.column_stack([speed * cos, speed * sin, -climb])
+
+
 class Drive:
     """A car-like vehicle that drives teardrop loops past a pole, then reverses along its own path.
 
@@ -92,19 +132,7 @@ class Drive:
         t_s, along_m = _schedule(self._path.length_m, rng)
         self._along = CubicSpline(t_s, along_m)
         self._end_s = float(t_s[-1])
-        self._height_m = -clearance_m
-        wavelength_m = rng.uniform(5.0, 12.0, (3, 3))
-        bearing_rad = rng.uniform(0, 2 * np.pi, (3, 3))
-        self._wave_k = (
-            2
-            * np.pi
-            / wavelength_m[..., None]
-            * np.stack([np.cos(bearing_rad), np.sin(bearing_rad)], axis=-1)
-        )  # (3 fields, 3 waves, 2)
-        self._wave_phase = rng.uniform(0, 2 * np.pi, (3, 3))
-        shares = np.array([0.5, 0.3, 0.2])
-        # Two slopes whose largest sum is 2.5°, and a height
-        self._wave_size = np.outer([np.deg2rad(1.75), np.deg2rad(1.75), 0.03], shares)
+        self._ground = Uneven(rng, clearance_m)
         turning = int(np.argmax(along_m))
         there, back = along_m[:turning], along_m[turning:]
         back_s = np.interp(-self._path.pole_m[::-1], -back, t_s[turning:])
@@ -122,18 +150,7 @@ class Drive:
         t = np.clip(np.atleast_1d(np.asarray(t_s, np.float64)), 0.0, self._end_s)
         along, speed = np.asarray(self._along(t)), np.asarray(self._along(t, 1))
         north, east, yaw = np.asarray(self._path.spline(along)).T
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        phase = (
-            np.multiply.outer(north, self._wave_k[..., 0]) + np.multiply.outer(east, self._wave_k[..., 1])
-        ) + self._wave_phase
-        slope_n, slope_e, height = np.sum(self._wave_size * np.sin(phase), axis=-1).T
-        rate = (self._wave_size * np.cos(phase))[:, 2]  # d height / d phase, of each wave
-        climb = speed * np.sum(
-            rate * (np.outer(cos, self._wave_k[2, :, 0]) + np.outer(sin, self._wave_k[2, :, 1])), axis=-1
-        )
-        position = np.column_stack([north, east, self._height_m - height])
-        rpy = np.column_stack([slope_n * sin - slope_e * cos, slope_n * cos + slope_e * sin, yaw])
-        return position, rpy, np.column_stack([speed * cos, speed * sin, -climb])
+        return self._ground.body(north, east, yaw, speed)
 
 
 def _turn(radius_m: float) -> Floats:

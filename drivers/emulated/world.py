@@ -205,6 +205,13 @@ class World:
         lat, lon, height = pymap3d.ned2geodetic(*position_m.T, at.lat_deg, at.lon_deg, at.height_m)
         return np.asarray(lat), np.asarray(lon), np.asarray(height)
 
+    def local(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Floats:
+        """Return north and east (N, 2) m of latitudes and longitudes (N,) in degrees."""
+        at = self.reference
+        lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
+        north, east, _ = pymap3d.geodetic2ned(lat, lon, at.height_m, at.lat_deg, at.lon_deg, at.height_m)
+        return np.column_stack([north, east])
+
     def _ground(self, origin: Floats, ray: Floats) -> Floats:
         with np.errstate(divide="ignore", invalid="ignore"):
             range_m = (self.ground_z_m - origin[:, 2]) / ray[:, 2]

@@ -333,4 +333,6 @@ def test_each_error_has_its_exit_code(error, code):
 def test_the_interface_names_every_request(protocol):
     page = (Path(protocol).parent / "interface.md").read_text()
     requests = page.split("Requests: ")[1].split("A bad request")[0]
-    assert all(f"{name}" in requests for name in control.REQUESTS if name not in ("SESSIONS", "REPORT"))
+    assert all(
+        f"{name}" in requests for name in control.REQUESTS if name not in ("SESSIONS", "REPORT", "ROUTE")
+    )

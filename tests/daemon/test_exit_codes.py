@@ -27,6 +27,7 @@ DAEMONS = {
     "report": ["report"],
     "passes": ["passes"],
     "sessions": ["sessions"],
+    "route": ["route"],
     "drop": ["drop", "front-001"],
     "keep": ["keep", "front-001"],
 }
@@ -52,6 +53,9 @@ CONFIG = {
 CONFIG["lasers"][0]["mount"] |= dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg"), 0)
 
 
+ROUTE = {"class": "ROUTE", "session": "s1", "why": [], "pole": None, "legs": [], "unseen": [], "left_out": 0}
+
+
 class Refuser:
     """Refuses whatever it is asked; or has a session that goes from state to state."""
 
@@ -73,6 +77,8 @@ class Refuser:
                 return {"class": "STOPPED", "session": "s1", "state": self.state}
             case "RESULT":
                 return {"class": "RESULT", "state": self.state, "lasers": [laser]}
+            case "ROUTE":
+                return ROUTE | {"state": self.state}
             case other:
                 return {"class": other, "sessions": [], "passes": [], "session": "s1", "next": None} | {
                     "state": self.state
@@ -116,7 +122,7 @@ def assert_told(lines, message=""):
 
 def test_no_verb_is_left_out_here():
     listed = {arguments[0] for arguments in (*DAEMONS.values(), *FILES.values())} | OTHERS
-    assert listed >= set(manual.verbs(field.make_parser())) - {"route"}
+    assert listed >= set(manual.verbs(field.make_parser()))
 
 
 @pytest.mark.parametrize(
@@ -240,6 +246,8 @@ def test_wrong_usage_is_2_and_names_the_help(line, run):
         (["result"], "rejected closed", 5),
         (["passes"], "collecting streaming", 0),
         (["sessions"], "idle closed", 0),
+        (["route"], "collecting streaming", 0),
+        (["route"], "accepted closed", 0),
     ],
 )
 def test_what_came_of_it_is_the_exit_code(arguments, state_and_device, code, daemon, run):
@@ -248,7 +256,7 @@ def test_what_came_of_it_is_the_exit_code(arguments, state_and_device, code, dae
     told, out, _ = run("--json", *arguments)
     assert told == code
     assert out.count("\n") == 1
-    assert json.loads(out)["class"] in ("STATUS", "STOPPED", "RESULT", "PASSES", "SESSIONS", "ERROR")
+    assert json.loads(out)["class"] in ("STATUS", "STOPPED", "RESULT", "PASSES", "SESSIONS", "ROUTE", "ERROR")
 
 
 def test_what_works_on_files_says_in_json_what_it_made(run, tmp_path, captures):
