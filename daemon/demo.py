@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import yaml
 from rich.console import Console
@@ -21,13 +23,17 @@ from rich.table import Table
 from polecal import PolecalError
 from polecal.calib import KEYS, PARAMETERS, Mount
 from polecal.daemon.control import Client
-from polecal.daemon.routine import ENDED
+from polecal.daemon.routefile import geojson
+from polecal.daemon.routine import ENDED, State
 from polecal.daemon.screen import Screen
 from polecal.daemon.sessions import CALIBRATION, CAPTURE
 
 _MEASURED = Mount(0.0, -0.35, -1.0, 0.0, -8.0, 0.0)  # paper.md, Table IV
 _POLE = {"radius_m": 0.04, "height_m": 2.4}
 _DRIVE_S = 270.0  # then what there is is calibrated
+_ROUTED_S = 600.0
+_ROOM = {"turn_radius_m": 3.0, "area_m": 15.0}  # that the emulated vehicle needs, and has
+_STOP_S = 3.0
 _READY_S = 20.0
 _LEAVE_S = 20.0
 _LINE_EVERY_S = 5.0
@@ -37,23 +43,25 @@ class DemoError(PolecalError):
     """A part of the demonstration did not come up."""
 
 
-def demo(out: Path, seed: int, console: Console) -> dict[str, Any]:
+def demo(out: Path, seed: int, console: Console, *, routed: bool = False) -> dict[str, Any]:
     """Run the demonstration into the folder ``out``, told on a console; give its calibration's content.
 
+    If it is ``routed``, no drive is planned beforehand: the vehicle drives what ROUTE says, until it is done.
     Raises DemoError, and what the daemon refuses.
     """
     out = out.resolve()
     out.mkdir(parents=True, exist_ok=True)
     began_s = time.monotonic()
     with ExitStack() as stack:
-        truth = stack.enter_context(_emulated_devices(out, seed))
+        truth, steering = stack.enter_context(_emulated_devices(out, seed, routed=routed))
         config = _write_config(out, truth)
         socket_path = stack.enter_context(_daemon(out, config))
         console.print(f"emulated laser and receiver (seed {seed}), and a real daemon: {out}")
         with Client(socket_path, timeout_s=None) as client:
             session = client.request({"class": "START", "name": "demo"})["session"]
             console.print(f"session {session}: the vehicle drives past the pole, about three minutes")
-            _follow(client, console, began_s + _DRIVE_S)
+            autopilot = Autopilot(client, steering, truth["pole"]) if steering is not None else None
+            _follow(client, console, began_s + (_ROUTED_S if routed else _DRIVE_S), autopilot)
             if client.request({"class": "STATUS"})["state"] not in ENDED:
                 client.request({"class": "STOP", "calibrate": True})
     folder = out / "state" / "sessions" / session
@@ -73,19 +81,23 @@ def demo(out: Path, seed: int, console: Console) -> dict[str, Any]:
 
 
 @contextmanager
-def _emulated_devices(out: Path, seed: int) -> Iterator[dict[str, Any]]:
-    """Serve the emulated devices; give their ports and the true mount."""
+def _emulated_devices(
+    out: Path, seed: int, *, routed: bool
+) -> Iterator[tuple[dict[str, Any], IO[bytes] | None]]:
+    """Serve the emulated devices; give their ports, the true mount, and what steers the vehicle."""
+    piped: dict[str, Any] = {"stdin": subprocess.PIPE} if routed else {}
     links = ["--lms-link", out / "tty-lms", "--span-link", out / "tty-span"]
+    options = [*links, "--seed", seed, *["--route"] * routed]
     with (
         (out / "emulate.log").open("wb") as log,
-        _program("field", "emulate", *links, "--seed", seed, stdout=subprocess.PIPE, stderr=log) as program,
+        _program("field", "emulate", *options, stdout=subprocess.PIPE, stderr=log, **piped) as program,
     ):
         assert program.stdout is not None
         line = program.stdout.readline()
         if not line:
             raise DemoError("the emulated devices did not start", f"see {out / 'emulate.log'}")
         truth: dict[str, Any] = json.loads(line)
-        yield truth
+        yield truth, program.stdin
 
 
 @contextmanager
@@ -136,12 +148,53 @@ def _write_config(out: Path, devices: Mapping[str, Any]) -> Path:
     return path
 
 
-def _follow(client: Client, console: Console, until_s: float) -> None:
+class Autopilot:
+    """Asks for a route while a session collects, and gives it to the vehicle; again once it is driven.
+
+    Also once the pole was seen, as until then the vehicle keeps far from where somebody said that it is.
+    """
+
+    def __init__(self, client: Client, steering: IO[bytes], pole: Sequence[float]) -> None:
+        self._steering = steering
+        self._path = client.path
+        self._request = {"class": "ROUTE", "pole": list(pole)} | _ROOM
+        self._known = ""
+        self._until_s = 0.0
+
+    def attend(self, status: Mapping[str, Any]) -> None:
+        """Take a STATUS, and do what it asks for."""
+        driven = time.monotonic() >= self._until_s
+        seen = self._known == "given" and any(laser["passes"] for laser in status["lasers"])
+        if status["state"] != State.COLLECTING or not (driven or seen):
+            return
+        with Client(self._path, timeout_s=None) as client:
+            route = client.request(self._request)
+        if not route["legs"]:
+            return
+        self._known = route["pole"]["known"]
+        self._until_s = time.monotonic() + _driven_s(route)
+        self._steering.write(geojson(route).encode())
+        self._steering.flush()
+
+
+def _driven_s(route: Mapping[str, Any]) -> float:
+    """Give about how long a route takes, with the stops before and after what is driven in reverse."""
+    total_s, way = _STOP_S, "forward"
+    for leg in route["legs"]:
+        length_m = sum(math.dist(one[:2], other[:2]) for one, other in pairwise(leg["points"]))
+        total_s += length_m / leg["speed_mps"] + _STOP_S * (leg["direction"] != way)
+        way = leg["direction"]
+    return total_s
+
+
+def _follow(client: Client, console: Console, until_s: float, autopilot: Autopilot | None = None) -> None:
     """Show the run until it ends: the status screen on a terminal, else a line now and then."""
     spoken_s = 0.0
     live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
     with live or ExitStack():
         for status in client.watch():
+            if autopilot is not None:
+                autopilot.attend(status)
             if live is not None:
                 live.update(Screen(status), refresh=True)
             elif time.monotonic() - spoken_s >= _LINE_EVERY_S:

@@ -190,9 +190,12 @@ def make_parser() -> argparse.ArgumentParser:
     emulate.add_argument("--span-link", metavar="PATH", help="name the receiver's terminal so")
     emulate.add_argument("--seed", type=int, default=1, metavar="N", help="which drive in which world")
     emulate.add_argument("--seconds", type=float, metavar="S", help="end after so long")
+    steered = "the vehicle drives the routes that come on standard input, each a line of GeoJSON"
+    emulate.add_argument("--route", action="store_true", help=steered)
     demo = verb(_demo, "calibrate emulated devices with a real daemon; found against true")
     demo.add_argument("--out", type=Path, metavar="DIR", help="where all of it goes")
     demo.add_argument("--seed", type=int, default=1, metavar="N", help="which drive in which world")
+    demo.add_argument("--route", action="store_true", help="with a vehicle that drives what `route` says")
     completion = verb(_completion, "print what makes a shell complete this command's arguments")
     completion.add_argument("shell", choices=COMPLETED, help="or of what to print the names")
     return parser
@@ -564,14 +567,16 @@ def _opened(name: str) -> Iterator[BufferedReader]:
 def _emulate(arguments: argparse.Namespace) -> int:
     from polecal.drivers.emulated.serve import run_emulate  # noqa: PLC0415
 
-    return run_emulate(arguments.lms_link, arguments.span_link, arguments.seed, arguments.seconds)
+    orders = sys.stdin if arguments.route else None
+    return run_emulate(arguments.lms_link, arguments.span_link, arguments.seed, arguments.seconds, orders)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
     from polecal.daemon.demo import demo  # noqa: PLC0415
 
     console = Console(stderr=arguments.json)
-    content = demo(arguments.out or Path(tempfile.mkdtemp(prefix="polecal-demo-")), arguments.seed, console)
+    out = arguments.out or Path(tempfile.mkdtemp(prefix="polecal-demo-"))
+    content = demo(out, arguments.seed, console, routed=arguments.route)
     if arguments.json:
         _print_json({"class": "RESULT"} | content)
     return 0 if content["state"] == State.ACCEPTED else Code.REJECTED

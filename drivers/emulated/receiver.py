@@ -37,6 +37,7 @@ __all__ = ["EmulatedReceiver", "Faults", "PlaybackReceiver", "load_recording", "
 _PERIODS_MS = frozenset((5, 10, 20, 50, 100, 200, 250, 500))  # below one second (section 5, rates)
 _BUFFER_BYTES = 4096  # that a port holds; logs that do not fit are lost
 _BLOCK = 64  # solutions worked out at once
+_BLOCK_MS = 1000  # of them, at most: a vehicle that is steered must not be asked far ahead
 _ONCE_NS = 20_000_000
 _OVERRUN_S = 1.0  # for which the status word speaks of a loss
 _STAGE_S = 2.0  # of aligning, at most, but for the last
@@ -413,13 +414,14 @@ class EmulatedReceiver(SpanPort):
         block = self._block
         if block is not None and block.start_ns == self._world.start_ns:
             i, odd = divmod(epoch_ms - block.first_ms, block.step_ms)
-            if not odd and 0 <= i < _BLOCK:
+            if not odd and 0 <= i < len(block.position):
                 return block
         step_ms = min((wanted.period_ms for wanted in self._logs.values() if wanted.period_ms), default=1)
+        count = max(1, min(_BLOCK, _BLOCK_MS // step_ms))
         position, rpy, velocity = self._world.nav(
-            self._world.seconds(self._moments(epoch_ms, step_ms, _BLOCK))
+            self._world.seconds(self._moments(epoch_ms, step_ms, count))
         )
-        moments = [self.epoch_ns(epoch_ms + i * step_ms) for i in range(_BLOCK)]
+        moments = [self.epoch_ns(epoch_ms + i * step_ms) for i in range(count)]
         at, leaning, _ = self._world.nav(self._world.seconds(moments))
         body = rotation(leaning)
         second = body @ self._second_m

@@ -14,15 +14,20 @@ import termios
 import threading
 import time
 import tty
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
+
 from polecal.drivers.emulated.line import EmulatedDevice
+from polecal.drivers.emulated.steer import Steered, lines
 from polecal.drivers.emulated.virtual import Rig
+from polecal.drivers.emulated.world import World
 
 _READ_BYTES = 4096
 _IDLE_S = 0.05
+_ROUGHLY_M = 0.4  # off is what an operator knows of the pole's place, in each direction
 _TCGETS2 = 0x802C542A  # asm-generic: reads struct termios2
 _TERMIOS2 = struct.Struct("<4IB19s2I")
 _BAUD_OF_SPEED = {
@@ -122,20 +127,43 @@ def serve(
                 flush_ns = now_ns + round(usb_latency_s * 1e9)
 
 
-def run_emulate(lms_link: str | None, span_link: str | None, seed: int, seconds: float | None) -> int:
+def _steer(world: World, orders: Iterable[str]) -> None:
+    vehicle = world.trajectory
+    if not isinstance(vehicle, Steered):
+        return
+    for order in orders:
+        vehicle.follow(lines(order, world.local))
+
+
+def run_emulate(
+    lms_link: str | None,
+    span_link: str | None,
+    seed: int,
+    seconds: float | None,
+    orders: Iterable[str] | None = None,
+) -> int:
     """Serve the demonstration's laser and receiver, the ``emulate`` verb; return its exit code.
 
-    Once both are there, prints one line: a JSON object with their paths and the laser's true mount. Ends
-    after so many seconds, or on SIGTERM or SIGINT.
+    Once both are there, prints one line: a JSON object with their paths and the laser's true mount, and
+    roughly the pole's place. Ends after so many seconds, or on SIGTERM or SIGINT. With ``orders`` the
+    vehicle stands until it is given a route: each line is one, as GeoJSON, and replaces the last.
     """
     stop = threading.Event()
-    rig = Rig.demo(seed, time.monotonic_ns())
+    t0_ns = time.monotonic_ns()
+    rig = Rig.demo(seed, t0_ns) if orders is None else Rig.steered(seed, t0_ns)
+    if orders is not None:
+        threading.Thread(target=_steer, args=(rig.world, orders), name="orders", daemon=True).start()
+    north, east = rig.world.pole_ne_m
+    place = rig.world.geodetic(np.array([[north + _ROUGHLY_M, east - _ROUGHLY_M, 0.0]]))
+    pole = [round(float(degrees[0]), 7) for degrees in place[:2]]
 
     def ready(paths: list[str]) -> None:
         lms, span = paths
         mount = asdict(rig.world.mount)
         sys.stdout.write(
-            json.dumps({"class": "EMULATE", "lms": lms, "span": span, "seed": seed, "mount": mount})
+            json.dumps(
+                {"class": "EMULATE", "lms": lms, "span": span, "seed": seed, "mount": mount, "pole": pole}
+            )
         )
         sys.stdout.write("\n")
         sys.stdout.flush()

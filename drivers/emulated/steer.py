@@ -66,6 +66,8 @@ class _Run:
             room = 2 * 0.8 * _ACCELERATION_MPS2 * (along[k + 1] - along[k])
             speed[k] = min(speed[k], sqrt(speed[k + 1] ** 2 + room))
         self.length_m = float(along[-1])
+        self.along_m = 0.0
+        """How far the vehicle has come."""
         self._along, self._speed = along, speed
         self._north, self._east = points.T
         end = points[-1] - points[-2] if len(points) > 1 else np.array([1.0, 0.0])
@@ -115,7 +117,6 @@ class Steered:
         self._state[0, :3] = begin
         self._count = 1
         self._runs: deque[_Run] = deque()
-        self._along_m = 0.0
         self._curvature = self._unsteady = self._speed = 0.0
 
     @property
@@ -129,9 +130,8 @@ class Steered:
         return self._state[: self._count, :2].copy()
 
     def follow(self, orders: Sequence[Line]) -> None:
-        """Follow these lines instead of any others."""
+        """Follow these lines instead of any others; may be called from another thread than `pose`."""
         self._runs = deque(_Run(list(group)) for _, group in groupby(orders, key=lambda line: line.way))
-        self._along_m = 0.0
 
     def pose(self, t_s: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Return position, roll pitch yaw (yaw not wrapped) and velocity, as `Trajectory` says."""
@@ -166,22 +166,22 @@ class Steered:
 
     def _wish(self, north: float, east: float, heading: float) -> tuple[float, float]:
         """Return the speed that it wants, and the curvature of where it goes (to the right), 1/m."""
-        if not self._runs:
+        runs = self._runs
+        if not runs:
             return 0.0, 0.0
-        run = self._runs[0]
-        self._along_m = run.nearest_m(north, east, self._along_m)
-        if run.length_m - self._along_m < _THERE_M:
+        run = runs[0]
+        run.along_m = run.nearest_m(north, east, run.along_m)
+        if run.length_m - run.along_m < _THERE_M:
             if abs(self._speed) < _STANDS_MPS:
-                self._runs.popleft()
-                self._along_m = 0.0
+                runs.popleft()
             return 0.0, self._curvature
         ahead_m = _AHEAD_M + _AHEAD_S * abs(self._speed)
-        to_north, to_east = run.at(self._along_m + ahead_m)
+        to_north, to_east = run.at(run.along_m + ahead_m)
         away_m = max(hypot(to_north - north, to_east - east), 0.3)
         course = heading if run.way > 0 else heading + pi
         aside = sin(atan2(to_east - east, to_north - north) - course)
         curvature = max(-self._sharpest, min(self._sharpest, 2 * aside / away_m))
-        creep = max(run.speed_mps(self._along_m), 0.1)
+        creep = max(run.speed_mps(run.along_m), 0.1)
         if self._speed * run.way < -_STANDS_MPS:
             return 0.0, curvature
         return run.way * creep, curvature

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from polecal.drivers.emulated.laser import EmulatedLaser
 from polecal.drivers.emulated.line import EmulatedDevice
 from polecal.drivers.emulated.receiver import EmulatedReceiver, PlaybackReceiver, recorded_path
-from polecal.drivers.emulated.world import MountPose, World, demo_world
+from polecal.drivers.emulated.steer import Steered
+from polecal.drivers.emulated.world import HAND_MEASURED, MountPose, World, demo_world, steered_world
 
 STREAM_LOGS = (("INSPVASB", 0.01), ("BESTPOSB", 1.0), ("TIMEB", 1.0))
 """What a host wants of the receiver, as (log, period in s)."""
@@ -35,6 +36,17 @@ class Rig:
     def demo(cls, seed: int, t0_ns: int) -> Rig:
         """Return the demonstration's world with both devices just powered up."""
         world = demo_world(seed)
+        return cls(
+            world,
+            EmulatedLaser(world, t0_ns=t0_ns, seed=seed),
+            EmulatedReceiver(world, t0_ns=t0_ns, seed=seed),
+        )
+
+    @classmethod
+    def steered(cls, seed: int, t0_ns: int, hand: MountPose = HAND_MEASURED) -> Rig:
+        """Return a vehicle that stands 9 m from a pole until it is told where to drive, as `Steered` is."""
+        vehicle = Steered((3.0, -6.0, 0.3), seed=seed)
+        world = steered_world(vehicle, seed, hand)
         return cls(
             world,
             EmulatedLaser(world, t0_ns=t0_ns, seed=seed),

@@ -69,6 +69,9 @@ class Reference:
     height_m: float
 
 
+POLE_NE_M = (12.0, -7.0)
+"""Where the demonstrations' pole stands."""
+
 REFERENCE = Reference(-33.889, 151.193, 60.0)
 
 
@@ -265,17 +268,16 @@ def rotation(rpy_rad: ArrayLike) -> Floats:
     return out
 
 
-def demo_world(seed: int = 0) -> World:
-    """Return the demonstration's world: the laser is not quite where it was measured to be.
+def off_by_hand(hand: MountPose, seed: int) -> MountPose:
+    """Return where a laser truly is that was measured to be at ``hand``.
 
     The error has random signs: 1.5 to 2.5° of yaw, 0.6 to 1.2° of pitch, 0.5 to 1° of roll and 2 to 6 cm
-    along each axis. A reflecting plate stands about 6 m from the pole.
+    along each axis.
     """
     rng = np.random.default_rng([seed, 0])
     size = rng.uniform([0.02, 0.02, 0.02, 0.5, 0.6, 1.5], [0.06, 0.06, 0.06, 1.0, 1.2, 2.5])
     x, y, z, roll, pitch, yaw = (size * rng.choice([-1.0, 1.0], 6)).tolist()
-    hand = HAND_MEASURED
-    mount = MountPose(
+    return MountPose(
         hand.x_m + x,
         hand.y_m + y,
         hand.z_m + z,
@@ -283,7 +285,32 @@ def demo_world(seed: int = 0) -> World:
         hand.pitch_deg + pitch,
         hand.yaw_deg + yaw,
     )
-    pole = (12.0, -7.0)
+
+
+def steered_world(vehicle: Trajectory, seed: int = 0, hand: MountPose = HAND_MEASURED) -> World:
+    """Return a world for a vehicle that is told where to drive, its laser measured to be at ``hand``.
+
+    The navigation's error changes every 15 s, as nobody knows when passes will be. A reflecting plate
+    stands 17 m from the pole.
+    """
+    north, east = POLE_NE_M
+    return World(
+        vehicle,
+        mount=off_by_hand(hand, seed),
+        pole_ne_m=POLE_NE_M,
+        reflectors=(Reflector(north + 17.0, east + 3.0, 190.0),),
+        nav_error=NavError(np.arange(0.0, 3600.0, 15.0), seed),
+        seed=seed,
+    )
+
+
+def demo_world(seed: int = 0) -> World:
+    """Return the demonstration's world: a laser not quite where it was measured to be (`off_by_hand`).
+
+    A reflecting plate stands about 6 m from the pole.
+    """
+    mount = off_by_hand(HAND_MEASURED, seed)
+    pole = POLE_NE_M
     drive = Drive(pole_ne_m=pole, seed=seed)
     return World(
         drive,
