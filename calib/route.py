@@ -260,7 +260,7 @@ class _Ways:
             return []
         # The vehicle may stand nearer, or farther, than it shall go
         at_m = hypot(begin[0], begin[1])
-        clear_m = min(self._clear_m, at_m - 0.05)
+        clear_m = min(self._clear_m, at_m - 0.01)
         area_m = max(
             self._area_m, hypot(end[0], end[1]), at_m + 2 * self._radius_m if at_m > self._area_m else 0
         )

@@ -59,7 +59,8 @@ def demo(out: Path, seed: int, console: Console, *, routed: bool = False) -> dic
         console.print(f"emulated laser and receiver (seed {seed}), and a real daemon: {out}")
         with Client(socket_path, timeout_s=None) as client:
             session = client.request({"class": "START", "name": "demo"})["session"]
-            console.print(f"session {session}: the vehicle drives past the pole, about three minutes")
+            minutes = "five" if routed else "three"
+            console.print(f"session {session}: the vehicle drives past the pole, about {minutes} minutes")
             autopilot = Autopilot(client, steering, truth["pole"]) if steering is not None else None
             _follow(client, console, began_s + (_ROUTED_S if routed else _DRIVE_S), autopilot)
             if client.request({"class": "STATUS"})["state"] not in ENDED:

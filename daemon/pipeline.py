@@ -312,7 +312,8 @@ class Pipeline:
             today = [one.moments for one in kept if one.moments.site == self._site]
             passes = [one.moments for one in kept]
             lasers.append(LaserStand(laser.name, laser.setup, laser.result, passes, today))
-        pose = self._navigation.trajectory.newest
+        knows = self.routine.running and not self._navigation.lost
+        pose = self._navigation.trajectory.newest if knows else None
         return Stand(
             state=self.routine.state,
             next=self._next(),

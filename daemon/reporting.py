@@ -26,11 +26,13 @@ from polecal import PolecalError, __version__
 from polecal.calib import CalibrationError, Mount, Pass, Returns, estimate
 from polecal.calib.estimate import Setup, split
 from polecal.calib.observability import weak_directions
+from polecal.calib.route import Leg
+from polecal.daemon import archive, recorder, results, route, sessions
 from polecal.daemon import config as configuration
-from polecal.daemon import recorder, results, sessions
 from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.navigation import name_of
 from polecal.daemon.recorder import Event, RecorderError
+from polecal.daemon.routine import State
 from polecal.daemon.sessions import CALIBRATION, CAPTURED_IN, SessionError, captures_of
 from polecal.drivers.novatel_span import Framer, accuracy, nav_state, parse
 
@@ -168,8 +170,18 @@ def _page(folder: Path) -> Page:
         notes=notes,
         history=[((t_ns - first_ns) / 1e9, entered, reason) for t_ns, entered, reason in heard.history],
         configuration=meta["config"],
+        route=() if state == State.ACCEPTED else _still_to_drive(folder),
     )
     return render(report)
+
+
+def _still_to_drive(folder: Path) -> Sequence[Leg]:
+    """Lay the route that a session still needs; none where that is not known."""
+    try:
+        config = archive.told(folder)[1]
+        return route.to_draw(config, archive.reopen(folder)[1].stand())
+    except PolecalError:  # the report says elsewhere what cannot be read
+        return ()
 
 
 def _metadata(folder: Path) -> tuple[dict[str, str], Path]:

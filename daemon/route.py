@@ -111,6 +111,14 @@ def answer(config: Config, stand: Stand, request: Mapping[str, Any]) -> dict[str
     }
 
 
+def to_draw(config: Config, stand: Stand) -> Sequence[Leg]:
+    """Lay the same drive about the pole, wherever that is, for a vehicle as it is by default."""
+    lacks, _ = _lacking(config, stand)
+    _, _, sigma_m = _pole(stand, (0.0, 0.0, 0.0)) or (None, None, _GIVEN_SIGMA_M)
+    both_ways = any(map(_wants_time, stand.lasers))
+    return plan(lacks, config.routine.slice_deg, Vehicle(), pole_sigma_m=sigma_m, both_ways=both_ways).legs
+
+
 def _lacking(config: Config, stand: Stand) -> tuple[list[Lack], list[str]]:
     """Say what each laser lacks, and in words."""
     if stand.state is State.ACCEPTED:

@@ -49,7 +49,7 @@ _STYLE: Any = {
     "axes.facecolor": "none",
     "savefig.facecolor": "none",
 }
-_styled = mpl.rc_context(_STYLE)
+styled = mpl.rc_context(_STYLE)
 HEADINGS = LinearSegmentedColormap.from_list(
     "headings", ["#2f6fd0", "#62c4bb", "#d8a520", "#8f2a5c", "#2f6fd0"], N=256
 )
@@ -87,7 +87,7 @@ class Quality:
     passes_s: tuple[tuple[float, float], ...]
 
 
-@_styled
+@styled
 def drawn(figure: Figure, name: str, title: str, caption: str, alt: str) -> Drawing:
     """Write a figure both ways."""
     page, picture = io.StringIO(), io.BytesIO()
@@ -105,7 +105,7 @@ def drawn(figure: Figure, name: str, title: str, caption: str, alt: str) -> Draw
     return Drawing(name, title, caption, alt, svg, picture.getvalue())
 
 
-@_styled
+@styled
 def pole(name: str, evidence: Evidence, radius_m: float) -> Drawing:
     """Draw the pole from above and from the side, before and after (Figs. 2, 3, 5, 6)."""
     figure = Figure(figsize=(9.6, 6.4), layout="constrained")
@@ -193,7 +193,7 @@ def _headings(figure: Figure, axes: Sequence[Axes] | Array, points: PathCollecti
     bar.set_label("heading of the vehicle")
 
 
-@_styled
+@styled
 def rose(name: str, coverage: Sequence[dict[str, int]], need: Need) -> Drawing:
     """Draw how many pole returns each slice of heading has."""
     counts = np.array([part["pole_returns"] for part in coverage], dtype=float)
@@ -236,7 +236,7 @@ def rose(name: str, coverage: Sequence[dict[str, int]], need: Need) -> Drawing:
     )
 
 
-@_styled
+@styled
 def curve(name: str, evidence: Evidence, threshold_m: float) -> Drawing:
     """Draw √c against returns (Fig. 7)."""
     passes, returns, cost_m = (np.array(column) for column in zip(*evidence.curve, strict=True))
@@ -269,7 +269,7 @@ def curve(name: str, evidence: Evidence, threshold_m: float) -> Drawing:
     )
 
 
-@_styled
+@styled
 def residuals(name: str, evidence: Evidence, slice_deg: int) -> Drawing:
     """Draw how far returns are off, by slice, range and bearing, before and after."""
     kinds = (
@@ -341,7 +341,7 @@ def _spread(
         axes.plot(middle, mid, "o-", color=colour, ms=3, lw=1.2, label=words)
 
 
-@_styled
+@styled
 def influence(name: str, weights: Sequence[Weight], sigma: Array, free: Sequence[bool]) -> Drawing | None:
     """Draw how far the result moves without each pass; None where that is not known."""
     known = [one for one in weights if one.shift is not None]
@@ -374,7 +374,7 @@ def influence(name: str, weights: Sequence[Weight], sigma: Array, free: Sequence
     )
 
 
-@_styled
+@styled
 def navigation(name: str, quality: Quality) -> Drawing:
     """Draw the navigation's own standard deviations and its status over time, the passes shaded."""
     names = list(dict.fromkeys(quality.status))

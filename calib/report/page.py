@@ -14,10 +14,11 @@ from polecal.calib.coverage import headings
 from polecal.calib.estimate import Setup
 from polecal.calib.geometry import wrap
 from polecal.calib.observations import KEYS, PARAMETERS, Mount
-from polecal.calib.report import figures
+from polecal.calib.report import drive, figures
 from polecal.calib.report.evidence import Evidence, Weight, largest, placed_to_m
 from polecal.calib.report.figures import Drawing, Quality
 from polecal.calib.report.rules import in_words, rules
+from polecal.calib.route import Leg
 
 _RANGES_M = (5, 10, 20, 40, 80)
 _EXTRAS = {
@@ -59,6 +60,8 @@ class Report:
     history: Sequence[tuple[float, str, str]]
     """(s since the first record, state entered, why)."""
     configuration: str
+    route: Sequence[Leg] = ()
+    """What is still to be driven, if anything is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +86,15 @@ def render(report: Report) -> Page:
     navigation = figures.navigation("navigation", report.quality) if report.quality else None
     drawings = [drawing for laser in lasers for drawing in laser["drawings"]]
     drawings += [navigation] if navigation else []
+    route = drive.route(report.route) if report.route else None
+    drawings += [route] if route else []
     environment.filters["minus"] = lambda text: str(text).replace("-", "−")
     html = environment.get_template("page.html.j2").render(
         report=report,
         accepted=report.state == "accepted" and all(laser["accepted"] for laser in lasers),
         lasers=lasers,
         navigation=navigation,
+        route=route,
     )
     return Page(html, drawings)
 

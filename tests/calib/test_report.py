@@ -23,6 +23,8 @@ from polecal.calib.report.evidence import Seen, gather, largest, moved, placed_t
 from polecal.calib.report.figures import HEADINGS
 from polecal.calib.report.page import LaserReport, Report, in_millimetres, render
 from polecal.calib.report.rules import rules
+from polecal.calib.route import Lack, Vehicle, plan
+from polecal.calib.sight import Sensor
 from polecal.daemon import results
 
 RADIUS_M = 0.04
@@ -286,3 +288,17 @@ def test_a_laser_that_was_not_accepted_makes_the_page_red_whatever_the_state_say
     assert "Accepted" not in head
     assert 'class="verdict"' in head
     assert "is above 0.001 m" in html.unescape(head)
+
+
+def test_what_is_still_to_be_driven_is_drawn_where_something_is(returns, setup, result, evidence, page):
+    assert "Still to be driven" not in page.html
+    mount = Mount(0.0, -0.35, -1.0, 0.0, -8.0, 0.0)
+    sensor = Sensor("front", mount, 100.0, 0.25, 0.04, 2.4, (0.1, 0.1), 18.77)
+    lacks = [Lack(sensor, {2: (1, 100), 7: (1, 100)})]
+    legs = plan(lacks, 30, Vehicle(), both_ways=True).legs
+    longer = page_of(returns, setup, result, evidence, route=legs, state="collecting")
+    assert "Still to be driven" in longer.html
+    drawing = longer.drawings[-1]
+    assert len(longer.drawings) == len(page.drawings) + 1
+    assert drawing.alt == "A route of 3 approaches, 1 of them in reverse, in slices 2, 7."
+    assert drawing.alt in longer.html

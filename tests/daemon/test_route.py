@@ -13,7 +13,7 @@ import pytest
 import structlog
 
 from polecal.calib.coverage import headings
-from polecal.daemon import archive, field, route, routefile
+from polecal.daemon import archive, field, reporting, route, routefile
 from polecal.daemon.control import MAX_LINE_BYTES, ControlServer, Refused, encode
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.routine import State
@@ -310,3 +310,22 @@ def test_the_command_says_what_the_vehicle_is_and_a_place_in_the_south(daemon):
 def test_a_place_that_is_none_is_a_usage_error(daemon, capsys):
     assert field.main(["route", "--pole", "here"]) == 2
     assert "hint:" in capsys.readouterr().err
+
+
+def test_the_report_draws_what_the_route_drives(answer, halfway):
+    legs = route.to_draw(halfway[1], halfway[0].stand())
+    assert {leg.slice for leg in legs if leg.kind == "pass"} == {leg["slice"] for leg in passes(answer)}
+
+
+def test_a_report_of_an_unfinished_session_lays_its_route(recorded, tmp_path):
+    folder = tmp_path / "20261122T000000Z-cut"
+    (folder / "passes").mkdir(parents=True)
+    for name in ("session.yaml", "calibration.yaml"):
+        (folder / name).write_bytes((recorded.session.folder / name).read_bytes())
+    for path in sorted((recorded.session.folder / "passes").glob("*.npz"))[:4]:
+        (folder / "passes" / path.name).write_bytes(path.read_bytes())
+    legs = reporting._still_to_drive(folder)
+    driven = {leg.slice for leg in legs if leg.kind == "pass"}
+    assert 0 < len(driven) < 12
+    (folder / "session.yaml").unlink()
+    assert reporting._still_to_drive(folder) == ()
