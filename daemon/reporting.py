@@ -176,7 +176,9 @@ def _page(folder: Path) -> Page:
 
 
 def _still_to_drive(folder: Path) -> Sequence[Leg]:
-    """Lay the route that a session still needs; none where that is not known."""
+    """Lay the route that a session still needs; none where that is not known, nor of a replay."""
+    if not sessions.captures_of(folder):
+        return ()
     try:
         config = archive.told(folder)[1]
         return route.to_draw(config, archive.reopen(folder)[1].stand())

@@ -321,9 +321,13 @@ def test_a_report_of_an_unfinished_session_lays_its_route(recorded, tmp_path):
     folder = tmp_path / "20261122T000000Z-cut"
     (folder / "passes").mkdir(parents=True)
     for name in ("session.yaml", "calibration.yaml"):
-        (folder / name).write_bytes((recorded.session.folder / name).read_bytes())
+        text = (recorded.session.folder / name).read_text(encoding="utf-8")
+        rejected = text.replace("state: accepted", "state: rejected", 1)
+        (folder / name).write_text(rejected, encoding="utf-8")
     for path in sorted((recorded.session.folder / "passes").glob("*.npz"))[:4]:
         (folder / "passes" / path.name).write_bytes(path.read_bytes())
+    assert reporting._still_to_drive(folder) == ()  # a replay's: nothing is driven there
+    (folder / "capture.mcap").symlink_to(recorded.session.capture)
     legs = reporting._still_to_drive(folder)
     driven = {leg.slice for leg in legs if leg.kind == "pass"}
     assert 0 < len(driven) < 12
