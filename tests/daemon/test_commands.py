@@ -173,7 +173,9 @@ def test_every_command_of_ours_does_what_it_is_there_for(desk, recorded, running
                 desk.done.add(typed)
         for typed in desk.left("doctor"):
             assert "front" in desk.run(typed, codes=(0, 1))
-        for typed in desk.left("result", "passes", "sessions", "report", "completion", "drop", "keep"):
+        for typed in desk.left(
+            "result", "passes", "sessions", "report", "route", "completion", "drop", "keep"
+        ):
             assert desk.run(typed)
         for typed in desk.left("export"):
             desk.run(typed)

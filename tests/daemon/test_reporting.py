@@ -215,7 +215,7 @@ def test_a_run_without_a_single_pass_says_so(settings, tmp_path, look):
     assert "the run ended: front: its port is gone" in seen["verdict"]
     assert is_red(seen["colour"])
     assert "Drive past the pole from every side" in seen["text"]
-    assert seen["figures"] == 1
+    assert seen["figures"] == 2  # the rose, and what is to be driven
 
 
 def test_passes_without_a_calibration_are_calibrated_for_the_page_and_never_accepted(copy, look):
