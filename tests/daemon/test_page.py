@@ -114,6 +114,14 @@ def test_the_page_may_load_and_run_nothing_but_what_is_in_its_file(serve):
     assert re.findall(r"https?://(?!www\.w3\.org/2000/svg)", HTML) == []
 
 
+def test_its_script_is_of_a_language_that_an_old_tablet_speaks():
+    (script,) = re.findall(r"<script>(.*?)</script>", HTML, re.DOTALL)
+    code = re.sub(r"//.*|\"[^\"\n]*\"", "", script)
+    newer = r"=>|`|\.\.\.|\?\.|\?\?|\b(?:let|const|class|async|await|fetch|Promise)\b"
+    assert re.findall(newer, code) == []  # than ES5 of 2011
+    assert len(code) > 5000
+
+
 def test_no_other_page_may_read_or_frame_it(serve):
     with serve(idle) as port:
         for path in ("/", "/status", "/clouds", "/nothing"):
@@ -547,6 +555,8 @@ def test_a_session_is_followed_live_from_its_start(bench, running, look):
         shown.get_by_text(session).wait_for(timeout=15000)
         shown.get_by_text("● streaming").nth(1).wait_for(timeout=15000)
         assert shown.locator(".slice").count() == 12
+        shown.locator("body[data-clouds='1']").wait_for(timeout=60000)  # of the pass that was just closed
+        assert min(shown.eval_on_selector_all("canvas", INKED)) > 100
         client.request({"class": "STOP"})
         shown.get_by_text("idle", exact=True).wait_for(timeout=15000)
         shown.context.close()
