@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polecal.calib import Kind, Mount, Returns, points_nav
+from polecal.calib import CalibrationError, Kind, Mount, Returns, points_nav
 
 _MOST_POINTS = 2400  # of a laser, in each of its two clouds
 _MOST_OF_A_PASS = 80
 _NEEDED = ("range_m", "bearing_rad", "position_m", "rpy_rad", "kind", "pass_id")
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+_DAMAGE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, CalibrationError),
+    *(zipfile.BadZipFile, zlib.error),
+)
 
 
 class Clouds:

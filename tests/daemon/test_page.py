@@ -389,6 +389,13 @@ def test_a_pass_that_is_not_written_yet_or_is_damaged_is_left_out(recorded, driv
     mounts = Mount(**status["measured"]), Mount(**status["estimate"])
     shown = Clouds(tmp_path, "front").show([1, 2, 998], *mounts)
     assert [one["pass"] for one in shown] == [1]
+    whole = (tmp_path / "passes" / "front-001.npz").read_bytes()
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        damaged = np.frombuffer(whole, dtype=np.uint8).copy()
+        damaged[rng.integers(0, len(damaged), 2000)] ^= 0x55
+        (tmp_path / "passes" / "front-001.npz").write_bytes(damaged.tobytes())
+        Clouds(tmp_path, "front").show([1], *mounts)
     assert Clouds(tmp_path, "front").show([2], *mounts) == []
 
 
