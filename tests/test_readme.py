@@ -13,6 +13,7 @@ import yaml
 from polecal.calib import Criteria, Kind, Need, Returns, Slice, acceptance, segment
 from polecal.calib.acceptance import Jump
 from polecal.calib.uncertainty import FEWEST_PASSES
+from polecal.daemon import manual
 from polecal.daemon.config import Config, loads
 from polecal.drivers.emulated.serve import serve
 from polecal.drivers.port import Port
@@ -119,6 +120,21 @@ def test_every_piece_of_configuration_is_one(piece):
 
 def test_the_pieces_are_found():
     assert {"accept:", "page: {listen: 127.0.0.1:8291}", "storage: {decoded: true}"} <= set(PIECES)
+
+
+OPTIONS = sorted(
+    {option for each in inline() if each.startswith("--") for option in re.findall(r"--[a-z-]+", each)}
+)
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_every_option_is_in_a_manual_page(option):
+    manuals = "".join(manual.pages().values()).replace("\\-", "-")
+    assert re.search(rf"{option}\b(?!-)", manuals)
+
+
+def test_the_options_are_found():
+    assert len(OPTIONS) >= 4
 
 
 # --- what they claim
