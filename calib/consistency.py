@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from polecal.calib.acceptance import Jump
 from polecal.calib.geometry import Array, wrap
 from polecal.calib.observations import PARAMETERS
-from polecal.calib.solve import Scatter, ground_rows, pole_rows
+from polecal.calib.solve import Scatter, Weights, ground_rows, pole_rows
 
 _FEWEST = 8
 _FEWEST_BEFORE = 3  # what came just before the end is what is true now: there a single pass counts
@@ -22,11 +22,14 @@ _FALSE_ALARMS = 1e-3
 
 
 def left_out_m(
-    pole: Scatter, ground: Scatter, used: NDArray[np.bool_], left_out: Array, ratios: tuple[float, float]
+    pole: Scatter, ground: Scatter, used: NDArray[np.bool_], left_out: Array, weights: Weights
 ) -> float:
     """Give √c in m of all used passes, each at the solution (P, 12) without it, about the others' means."""
     total = 0.0
-    for scatter, rows_at, ratio in ((pole, pole_rows, ratios[0]), (ground, ground_rows, ratios[1])):
+    for scatter, rows_at, ratio in (
+        (pole, pole_rows, weights.pole_ratio),
+        (ground, ground_rows, weights.ground_ratio),
+    ):
         squares = sum(
             scatter.left_out(number, rows_at(vector), used, ratio)
             for number, vector in zip(np.flatnonzero(used).tolist(), left_out, strict=True)

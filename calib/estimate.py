@@ -17,7 +17,7 @@ from polecal.calib.coverage import Need, Slice, coverage, slice_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
 from polecal.calib.observations import PARAMETERS, CalibrationError, Kind, Mount, Returns, axis_shift_m
-from polecal.calib.solve import EXTRAS, UNKNOWNS, Form, Scatter, ground_rows, pole_rows
+from polecal.calib.solve import EXTRAS, PAPER, UNKNOWNS, Form, Scatter, Weights, ground_rows, pole_rows
 from polecal.calib.uncertainty import FEWEST_PASSES, from_model, jackknife
 
 MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
@@ -33,7 +33,6 @@ _MOST_SET_ASIDE = 0.25  # of all passes: where more disagree, it is not they tha
 _LEAST_M = 0.02  # of √c: what few passes fit better than their returns are is fitted too well
 _FARTHEST = 20.0  # σ of the hand measurement: beyond, there is no such mount
 _ODD, _ODD_M = 6.0, 0.06  # times the passes' median, and at least so far
-_PAPER = (np.inf, np.inf)  # `Scatter.form`'s ratios of pole and ground: Eq. 7 to the letter
 _TELLING = (10e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
 """What an extra may be where the data know it no better: the latency of a serial adapter; 5 mm; 5 mm on a
 metre; 2 cm on ten."""
@@ -67,6 +66,12 @@ class Setup:
     pole_radius_m: float = 0.0
     pass_error: bool = True
     """Whether each pass may have a navigation error of its own, which weighs it down; else Eq. 7 as it is."""
+    by_kind: bool = False
+    """With ``pass_error``: whether pole and ground count by how their returns scatter (`solve.Weights`).
+
+    Nearer to the least error possible, but it trusts each of the ground's many returns: that needs ground
+    whose bumps are smaller than the way between them.
+    """
     rough_ground: bool = True
     """Whether the bias that rough ground has in Eq. 6 is taken off (`solve.Form.rough_m2`)."""
     extras: frozenset[str] = frozenset(EXTRAS)
@@ -269,8 +274,7 @@ class _Found:
     vector: Array
     covariance: Array
     held: frozenset[str]
-    ratios: tuple[float, float]
-    rough_m2: float
+    weights: Weights
     left_out: Array | None
     """(P, 12) without each used pass, or None where there are too few."""
 
@@ -293,17 +297,20 @@ class _Problem:
         numbers = np.flatnonzero(used)
         enough = len(numbers) >= FEWEST_PASSES
         held = {*setup.hold, *EXTRAS} - (setup.extras if enough else set())
-        ratios, rough_m2 = _PAPER, 0.0
-        if (setup.pass_error or setup.rough_ground) and enough:  # both are fixed from here on
-            about = solve.minimise(self._form(used, ratios), measured, held)
-            if setup.pass_error:
-                ratios = self.pole.ratio(pole_rows(about), used), self.ground.ratio(ground_rows(about), used)
-            if setup.rough_ground:
-                rough_m2 = self.ground.mean_within(ground_rows(about), used)
-        whole = self._form(used, ratios, rough_m2)
-        without = (
-            [self._form(_but(used, one), ratios, rough_m2) for one in numbers.tolist()] if enough else []
-        )
+        paper, weights = self._form(used), PAPER
+        if (setup.pass_error or setup.rough_ground) and enough:  # fixed from here on
+            about = solve.minimise(paper, measured, held)
+            weights = Weights.told(
+                self.pole,
+                self.ground,
+                used,
+                about,
+                pass_error=setup.pass_error,
+                rough=setup.rough_ground,
+                by_kind=setup.pass_error and setup.by_kind,
+            )
+        whole = self._form(used, weights)
+        without = [self._form(_but(used, one), weights) for one in numbers.tolist()] if enough else []
         # What the data know no better than the tape measure is not taken from them. On a flat pad z is
         # nearly free (paper.md, later work 4) and more passes hardly help: it meets its bound, or is held.
         believable = self._measured_sigma.copy()
@@ -313,20 +320,20 @@ class _Problem:
         while True:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
-            squared = max(whole.spread(vector), _LEAST_M**2)
+            squared = max((paper if weights.ground_return else whole).spread(vector), _LEAST_M**2)
             left_out = None
             if enough:
                 left_out = np.stack([solve.minimise(part, vector, held) for part in without])
                 covariance = jackknife(left_out)
             else:
-                covariance = from_model(whole.slope(vector)[1], squared, len(numbers), free)
+                covariance = from_model(whole.information(vector), squared, len(numbers), free)
             # A scatter cannot see what no pass tells at all; what all returns, were they independent, could
             # tell at best can. Where the minimum is may hide it: off level the cosine of a level sensor's
             # pitch stretches the ranges, and noise puts it there. So it must be told at the measured mount,
             # too.
             count = int(self.pole.count[used].sum())
             best = [
-                np.diag(from_model(whole.slope(at)[1], squared, count, free)) for at in (vector, measured)
+                np.diag(from_model(whole.information(at), squared, count, free)) for at in (vector, measured)
             ]
             doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*best))) / believable
             if not enough:  # few passes can be fitted by a mount that cannot be: it is not their noise
@@ -334,7 +341,7 @@ class _Problem:
                 doubt = np.maximum(doubt, far * free)
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
-                return _Found(vector, covariance, frozenset(held), ratios, rough_m2, left_out)
+                return _Found(vector, covariance, frozenset(held), weights, left_out)
             held.add(UNKNOWNS[worst])
 
     def oddest(self, used: NDArray[np.bool_], vector: Array) -> tuple[int, str] | None:
@@ -389,7 +396,7 @@ class _Problem:
             improvement = doubling = 0.0
         left_out_m = None
         if found.left_out is not None:
-            left_out_m = consistency.left_out_m(self.pole, self.ground, used, found.left_out, found.ratios)
+            left_out_m = consistency.left_out_m(self.pole, self.ground, used, found.left_out, found.weights)
         slices = coverage([one.pole_returns for one in passes], setup.need)
         verdict = judge(
             criteria=setup.criteria,
@@ -436,7 +443,7 @@ class _Problem:
         """Find the minimum of some passes, what is held and how they weigh as in ``found``."""
         some = np.zeros(len(self._passes), dtype=bool)
         some[list(numbers)] = True
-        return solve.minimise(self._form(some, found.ratios, found.rough_m2), found.vector, found.held)
+        return solve.minimise(self._form(some, found.weights), found.vector, found.held)
 
     def _not_told(self, used: NDArray[np.bool_], found: _Found) -> Array:
         """Give what the extras that should be solved for and cannot add to the covariance (6, 6).
@@ -446,7 +453,7 @@ class _Problem:
         """
         free = ~_mask(found.held)
         untold = np.flatnonzero(_mask(self._setup.extras & found.held))
-        hessian = self._form(used, found.ratios).slope(found.vector)[1]
+        hessian = self._form(used, found.weights).information(found.vector)
         moved = np.zeros((len(UNKNOWNS), len(untold)))
         moved[free] = np.linalg.pinv(hessian[np.ix_(free, free)], rcond=1e-12, hermitian=True) @ (
             -hessian[np.ix_(free, untold)] * self._measured_sigma[untold]
@@ -454,11 +461,15 @@ class _Problem:
         added: Array = moved[:6] @ moved[:6].T
         return added
 
-    def _form(
-        self, used: NDArray[np.bool_], ratios: tuple[float, float] = _PAPER, rough_m2: float = 0.0
-    ) -> Form:
-        pole, ground = self.pole.form(used, ratios[0]), self.ground.form(used, ratios[1])
-        return Form(pole, ground, rough_m2, self.ground.ray(used) if rough_m2 else None)
+    def _form(self, used: NDArray[np.bool_], weights: Weights = PAPER) -> Form:
+        return Form(
+            self.pole.form(used, weights.pole_ratio),
+            self.ground.form(used, weights.ground_ratio),
+            weights.rough_m2,
+            self.ground.ray(used) if weights.rough_m2 else None,
+            self.ground.within_form(used) if weights.rough_m2 and weights.ground_return else None,
+            weights.balance(self.pole.count[used].sum(), self.ground.count[used].sum()),
+        )
 
 
 def _but(used: NDArray[np.bool_], *numbers: int) -> NDArray[np.bool_]:

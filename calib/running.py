@@ -17,7 +17,7 @@ from polecal.calib.estimate import Pass, Result, Setup, scatter_of, sum_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
 from polecal.calib.observations import Kind, Mount, Returns
-from polecal.calib.solve import EXTRAS, Form, Scatter, ground_rows, pole_rows
+from polecal.calib.solve import EXTRAS, PAPER, Form, Scatter, Weights
 from polecal.calib.uncertainty import FEWEST_PASSES
 
 
@@ -30,6 +30,7 @@ class _Closed:
     mean: Array
     summed: Array
     ray: Array
+    within: Array
     ratio: float
 
     @classmethod
@@ -41,6 +42,7 @@ class _Closed:
             *scatter.weighted_mean(used & (scatter.sites == site), ratio),
             count * scatter.form(used, ratio),
             count * scatter.ray(used),
+            count * scatter.within_form(used),
             ratio,
         )
 
@@ -68,19 +70,30 @@ class Running:
         self._vector = np.concatenate([result.mount.vector, extras])
         self._radius_m = setup.pole_radius_m
         self._open = {kind: moments.zero() for kind in Kind}
-        self._closed: dict[Kind, _Closed] = {}
-        for kind, rows in ((Kind.POLE, pole_rows(self._vector)), (Kind.GROUND, ground_rows(self._vector))):
-            scatter = self._scatter([one.total(kind) for one in used], kind, [one.site for one in used])
-            enough, seen = len(used) >= FEWEST_PASSES, scatter.count > 0
-            ratio = scatter.ratio(rows, seen) if setup.pass_error and enough else np.inf
-            self._rough_m2 = scatter.mean_within(rows, seen) if setup.rough_ground and enough else 0.0
-            self._closed[kind] = _Closed.of(scatter, ratio, used[-1].site)
+        sites = [one.site for one in used]
+        pole, ground = (self._scatter([one.total(kind) for one in used], kind, sites) for kind in Kind)
+        self._weights = PAPER
+        if len(used) >= FEWEST_PASSES:
+            every = np.ones(len(used), dtype=bool)
+            self._weights = Weights.told(
+                pole,
+                ground,
+                every,
+                self._vector,
+                pass_error=setup.pass_error,
+                rough=setup.rough_ground,
+                by_kind=setup.pass_error and setup.by_kind,
+            )
+        self._closed = {
+            Kind.POLE: _Closed.of(pole, self._weights.pole_ratio, sites[-1]),
+            Kind.GROUND: _Closed.of(ground, self._weights.ground_ratio, sites[-1]),
+        }
 
     @one_thread
     def add(self, returns: Returns) -> Mount:
         """Add returns of the open pass, and solve again."""
         forms: dict[Kind, Array] = {}
-        ray = self._closed[Kind.GROUND].ray
+        ray, bumps = self._closed[Kind.GROUND].ray, self._closed[Kind.GROUND].within
         for kind, closed in self._closed.items():
             of_kind = np.flatnonzero(returns.kind == kind)
             blocks = moments.by_group(
@@ -95,8 +108,19 @@ class Running:
             within = scatter.form(one, closed.ratio)
             forms[kind] = closed.form(scatter.count[0], scatter.weighted_mean(one)[1], within)
             if kind is Kind.GROUND:
-                ray = (ray + scatter.count[0] * scatter.ray(one)) / max(1.0, closed.count + scatter.count[0])
-        form = Form(forms[Kind.POLE], forms[Kind.GROUND], self._rough_m2, ray if self._rough_m2 else None)
+                count = scatter.count[0]
+                ray = (ray + count * scatter.ray(one)) / max(1.0, closed.count + count)
+                bumps = (bumps + count * scatter.within_form(one)) / max(1.0, closed.count + count)
+        form = Form(
+            forms[Kind.POLE],
+            forms[Kind.GROUND],
+            self._weights.rough_m2,
+            ray if self._weights.rough_m2 else None,
+            bumps if self._weights.rough_m2 and self._weights.ground_return else None,
+            self._weights.balance(
+                *(closed.count + self._open[kind].count for kind, closed in self._closed.items())
+            ),
+        )
         self._vector = solve.minimise(form, self._vector, self._held)
         return Mount.from_vector(self._vector[:6])
 

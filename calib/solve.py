@@ -30,6 +30,8 @@ _CLEARLY = 0.995  # of √c: on flat ground the mirror image is as good, but for
 _NOTHING = 1e-15
 _DESCENTS = 40
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
+_LEAST_ROUGH = 1e-6  # of the ground's variance
+_LEAST_M2 = 1e-6  # of a return's own variance: no laser is as good as 1 mm
 
 
 _RAY = np.zeros(WIDTH, dtype=bool)  # what a range scales in h⁺: a beam's way from the sensor to its return
@@ -88,6 +90,11 @@ class Scatter:
             within = within - self._aside[used].sum(axis=0)
         form: Array = (within + (weight[:, None] * apart).T @ apart) / total
         return form
+
+    def within_form(self, used: NDArray[np.bool_]) -> Array:
+        """Give the part (108, 108) of `form` that is within the used passes, m²."""
+        within: Array = self._within[used].sum(axis=0) / max(1.0, self.count[used].sum())
+        return within
 
     def ray(self, used: NDArray[np.bool_]) -> Array:
         """Give the mean (108,) of the used passes' features, all but those of the beams' way left out."""
@@ -189,6 +196,59 @@ def _aside(one: Moments) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
+class Weights:
+    """What returns count, fixed before a solution: as in Eq. 7 to the letter, or as they tell themselves."""
+
+    pole_ratio: float = np.inf
+    ground_ratio: float = np.inf
+    """`Scatter.form`'s."""
+    ground_return: float | None = None
+    """What the square of a ground return counts against a pole return's; None: Eq. 7, mean against mean."""
+    rough_m2: float = 0.0
+    """`Form.rough_m2`."""
+
+    @classmethod
+    def told(
+        cls,
+        pole: Scatter,
+        ground: Scatter,
+        used: NDArray[np.bool_],
+        about: Array,
+        *,
+        pass_error: bool,
+        rough: bool,
+        by_kind: bool,
+    ) -> Weights:
+        """Estimate them from the used passes at a vector (12,) about the minimum.
+
+        By ``pass_error`` passes count by how their means scatter, ``by_kind`` kinds by how their returns
+        scatter within the passes: there are many more returns of the ground, and each is as good as one of
+        a pole, or better, whose own width scatters it. ``rough`` ground is what scatters within the passes.
+        """
+        north_east, down = pole_rows(about), ground_rows(about)
+        ground_m2 = ground.mean_within(down, used)
+        ratios = (pole.ratio(north_east, used), ground.ratio(down, used)) if pass_error else (np.inf, np.inf)
+        if not by_kind:
+            return cls(*ratios, rough_m2=ground_m2 * rough)
+        pole_m2 = max(pole.mean_within(north_east, used), _LEAST_M2)
+        return cls(
+            *ratios,
+            pole_m2 / max(ground_m2, _LEAST_M2),
+            ground_m2 if rough and ground_m2 > _LEAST_M2 else 0.0,
+        )
+
+    def balance(self, pole_returns: float, ground_returns: float) -> float:
+        """Give `Form.balance` of so many returns."""
+        if self.ground_return is None or not pole_returns or not ground_returns:
+            return 1.0
+        return self.ground_return * ground_returns / pole_returns
+
+
+PAPER = Weights()
+"""Eq. 7 to the letter."""
+
+
+@dataclass(frozen=True, slots=True)
 class Form:
     """Eq. 7 as a function of the unknowns: the covariances of both kinds' features, (108, 108) each."""
 
@@ -202,43 +262,100 @@ class Form:
     is wrong by σ² ∂ ln d on average, that is, rough ground looks flattest to a mount that sees it less
     steeply than the true one. In words of likelihood: the density of what is measured, the range, is that of
     the height times d, and Eq. 6 leaves out the factor. As d is the sensor's height over the ground by the
-    range, the missing term is -2 σ² ln of that height but for what no mount changes.
+    range, the missing term is -2 σ² ln of that height but for what no mount changes. And σ² itself is only
+    told by the same returns: with ``bumps``, Eq. 6 / σ² within the passes becomes its logarithm, else
+    what the first solution took the ground's roughness for would hold the beams to the slant of that solution.
     """
     ray: Array | None = None
     """(108,) `Scatter.ray` of the ground, where it is rough."""
+    bumps: Array | None = None
+    """(108, 108) `Scatter.within_form`, a part of ``ground``, where how rough it is is not taken as known."""
+    balance: float = 1.0
+    """What the variance of the ground counts against that of the pole; 1 is Eq. 7 to the letter."""
 
     def spread(self, vector: Array) -> float:
-        """Give the quadratic part of c in m² at ``vector`` (12,), the variances of Eq. 7."""
+        """Give the quadratic part of c in m² at ``vector`` (12,), the variances of Eq. 7 in balance."""
         h = _h(vector)
         pole, ground = _rows(_pole_weights(vector)[0], h), _rows(_ground_weights(vector)[0], h)
-        return float((pole @ self.pole * pole).sum() + (ground @ self.ground * ground).sum())
+        return float((pole @ self.pole * pole).sum() + self.balance * (ground @ self.ground * ground).sum())
 
     def cost(self, vector: Array) -> float:
         """Give what is minimised, c in m² at ``vector`` (12,); on rough ground it may be negative."""
         if self.ray is None:
             return self.spread(vector)
-        height_m = float(abs(ground_rows(vector)[0] @ self.ray))
-        return self.spread(vector) - 2.0 * self.rough_m2 * float(np.log(max(height_m, _LEAST_HEIGHT_M)))
+        down = ground_rows(vector)[0]
+        if self.bumps is None:
+            grazed = 2.0 * np.log(max(float(abs(down @ self.ray)), _LEAST_HEIGHT_M))
+            return self.spread(vector) - self.balance * self.rough_m2 * float(grazed)
+        bumps_m2 = float(down @ self.bumps @ down)
+        rough = bumps_m2 / self.rough_m2
+        height_m = float(abs(down @ self.ray))
+        grazed = np.log(max(rough, _LEAST_ROUGH)) + 1.0 - 2.0 * np.log(max(height_m, _LEAST_HEIGHT_M))
+        return self.spread(vector) + self.balance * float(self.rough_m2 * grazed - bumps_m2)
 
     def slope(self, vector: Array) -> tuple[Array, Array]:
-        """Give half the gradient (12,) and half the Gauss-Newton Hessian (12, 12) of c."""
-        gradient, hessian = np.zeros(len(UNKNOWNS)), np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
+        """Give half the gradient (12,) of c, and what comes near half its Hessian (12, 12) about a minimum.
+
+        That is Gauss's and Newton's; only on rough ground it need not be positive definite.
+        """
+        pole, ground, steeper = self._half_slopes(vector)
+        gradient, hessian = ground
+        if steeper is not None:
+            gradient = gradient - self.rough_m2 * steeper
+        if steeper is not None and self.bumps is not None:
+            h = _h(vector)
+            down = ground_rows(vector)[0]
+            weights = _ground_weights(vector)
+            bumps = _half_slope(self.bumps, *weights, h, _h_gradient(vector, h))
+            less = 1.0 / max(float(down @ self.bumps @ down) / self.rough_m2, _LEAST_ROUGH) - 1.0
+            gradient = gradient + less * bumps[0]
+            hessian = hessian + less * bumps[1] - self.rough_m2 * np.outer(steeper, steeper)
+        return pole[0] + self.balance * gradient, pole[1] + self.balance * hessian
+
+    def information(self, vector: Array) -> Array:
+        """Give half the Hessian (12, 12) that c has on average where ``vector`` is true.
+
+        How steeply the beams meet rough ground is not told by how rough it looks.
+        """
+        pole, ground, steeper = self._half_slopes(vector)
+        told = (
+            ground[1]
+            if steeper is None or self.bumps is None
+            else ground[1] - self.rough_m2 * np.outer(steeper, steeper)
+        )
+        return pole[1] + self.balance * told
+
+    def _half_slopes(self, vector: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], Array | None]:
+        """Give `_half_slope` of both kinds, and on rough ground the derivative (12,) of ln of its height."""
         h = _h(vector)
         dh = _h_gradient(vector, h)
-        for matrix, weights in ((self.pole, _pole_weights(vector)), (self.ground, _ground_weights(vector))):
-            for weight, dweight in zip(*weights, strict=True):
-                jacobian = (weight[:, None, None] * dh + dweight[:, None] * h[:, None]).reshape(3 * WIDTH, -1)
-                pulled = matrix @ jacobian
-                gradient += pulled.T @ np.outer(weight, h).ravel()
-                hessian += jacobian.T @ pulled
-        if self.ray is not None:  # the ground's jacobian came last
-            height_m = np.outer(weight, h).ravel() @ self.ray
-            gradient -= self.rough_m2 / height_m * (self.ray @ jacobian)
-        return gradient, hessian
+        weights, dweights = _ground_weights(vector)
+        steeper = None
+        if self.ray is not None:
+            down = _jacobian(weights[0], dweights[0], h, dh)
+            steeper = self.ray @ down / (_rows(weights, h)[0] @ self.ray)
+        pole = _half_slope(self.pole, *_pole_weights(vector), h, dh)
+        return pole, _half_slope(self.ground, weights, dweights, h, dh), steeper
+
+
+def _jacobian(weight: Array, dweight: Array, h: Array, dh: Array) -> Array:
+    """Give the derivative (108, 12) of an axis's row, so weighted."""
+    return (weight[:, None, None] * dh + dweight[:, None] * h[:, None]).reshape(3 * WIDTH, -1)
+
+
+def _half_slope(matrix: Array, weights: Array, dweights: Array, h: Array, dh: Array) -> tuple[Array, Array]:
+    """Give half the gradient (12,) and half the Gauss-Newton Hessian (12, 12) of one kind's variances."""
+    gradient, hessian = np.zeros(len(UNKNOWNS)), np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
+    for weight, dweight in zip(weights, dweights, strict=True):
+        jacobian = _jacobian(weight, dweight, h, dh)
+        pulled = matrix @ jacobian
+        gradient += pulled.T @ np.outer(weight, h).ravel()
+        hessian += jacobian.T @ pulled
+    return gradient, hessian
 
 
 def cost_m(form: Form, vector: Array) -> float:
-    """Give √c of Eq. 7 in m at ``vector`` (12,)."""
+    """Give √ of what a form spreads, in m at ``vector`` (12,): of one without weights √c of Eq. 7."""
     return float(np.sqrt(max(0.0, form.spread(vector))))
 
 
@@ -270,6 +387,8 @@ def minimise(form: Form, start: Array, held: Collection[str] = ()) -> Array:
     for _ in range(_STEPS):
         gradient, hessian = form.slope(vector)
         gradient, hessian = gradient[free], hessian[np.ix_(free, free)]
+        if form.bumps is not None:
+            hessian = _upward(hessian)
         while damping < _GIVE_UP:
             step = np.zeros(len(UNKNOWNS))
             step[free] = -np.linalg.lstsq(_damped(hessian, damping), gradient, rcond=1e-15)[0]
@@ -313,12 +432,12 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
     base[BASE] = np.eye(10)
     base[RANGE, :6] = start[7] * np.eye(6)
     base[TIME], base[TIME_SQUARED] = start[6] * np.eye(10), start[6] ** 2 * np.eye(10)
-    rows = [(form.pole, weight) for weight in _pole_weights(start)[0]]
-    rows += [(form.ground, weight) for weight in _ground_weights(start)[0]]
+    rows = [(form.pole, 1.0, weight) for weight in _pole_weights(start)[0]]
+    rows += [(form.ground, form.balance, weight) for weight in _ground_weights(start)[0]]
     q = np.zeros((10, 10))
-    for matrix, weight in rows:
+    for matrix, counts, weight in rows:
         part = np.kron(weight[:, None], base)
-        q += part.T @ matrix @ part
+        q += counts * (part.T @ matrix @ part)
     free = [6 + axis for axis in range(3) if UNKNOWNS[axis] not in held]
     known = np.zeros((10, 7))
     known[:6, :6] = np.eye(6)
@@ -398,6 +517,14 @@ def _ground_weights(vector: Array) -> tuple[Array, Array]:
     gradient = np.zeros((1, 3, len(UNKNOWNS)))
     gradient[0, 0, 10] = gradient[0, 1, 11] = 1.0
     return np.array([[vector[10], vector[11], 1.0]]), gradient
+
+
+def _upward(hessian: Array) -> Array:
+    """Give a Hessian as curved, but upward everywhere: each unknown in its own scale."""
+    scale = np.sqrt(np.abs(np.diag(hessian))) + 1e-150
+    values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
+    upward: Array = (vectors * np.abs(values)) @ vectors.T * np.outer(scale, scale)
+    return upward
 
 
 def _damped(hessian: Array, damping: float) -> Array:

@@ -315,3 +315,10 @@ def test_a_thick_pole_does_not_look_nearer_where_passes_have_errors_of_their_own
         result = estimate(passes_of(returns, 30), setup)
         ranges_m.append(result.extras["range_m"])
     assert np.mean(ranges_m) == pytest.approx(0.0, abs=0.0025)
+
+
+def test_kinds_that_count_by_their_own_scatter_tell_yaw_and_position_better(rig):
+    by_kind = replace(SETUP, by_kind=True)
+    without, with_it = errors_of_many_drives(rig, SETUP, by_kind)
+    assert (rms(with_it) < 1.1 * rms(without)).all()
+    assert rms(with_it)[5] < 0.95 * rms(without)[5]

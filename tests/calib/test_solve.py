@@ -31,6 +31,21 @@ def test_slope_is_half_the_costs_derivative_on_rough_ground_and_by_a_thick_pole(
         assert form.slope(vector)[0] == pytest.approx(np.array(differences), rel=1e-5, abs=1e-8)
 
 
+def test_slope_is_half_the_costs_derivative_where_roughness_is_not_known_and_kinds_are_weighed(form, start):
+    unknown = Form(form.pole, form.ground, ROUGH_M2, form.ray, 0.9 * form.ground, 20.0)
+    steps = 1e-6 * np.eye(12)
+    differences = [(unknown.cost(start + step) - unknown.cost(start - step)) / 4e-6 for step in steps]
+    assert unknown.slope(start)[0] == pytest.approx(np.array(differences), rel=1e-5, abs=1e-7)
+
+
+def test_how_rough_unknown_ground_was_taken_for_does_not_move_its_minimum(form, start):
+    """On level ground the beams' slant would else be held to that at which the roughness was estimated."""
+    once, twice = (
+        Form(0 * form.pole, form.ground, times * ROUGH_M2, form.ray, form.ground) for times in (1, 2)
+    )
+    assert twice.slope(start)[0] == pytest.approx(2 * once.slope(start)[0], rel=1e-9)
+
+
 def test_rough_ground_takes_off_the_logarithm_of_the_sensors_height(form, rig, start):
     """The body is at z = 0 like the ground, and the sensor 1 m above it."""
     eq7 = Form(form.pole, form.ground)

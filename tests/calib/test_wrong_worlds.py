@@ -68,7 +68,7 @@ def pole_moved_half_way(rng: np.random.Generator) -> Returns:
 
 def late_at_one_speed(rng: np.random.Generator) -> Returns:
     """By up to the latency of a bad adapter, on more even ground or less."""
-    returns = driven(rng, speeds_mps=(rng.uniform(1.0, 4.0),), tilt_deg=rng.choice([1.0, 2.0]))
+    returns = driven(rng, speeds_mps=(rng.uniform(1.0, 4.0),), tilt_deg=rng.choice([0.0, 0.3, 1.0, 2.0]))
     late_s = rng.uniform(0.0, 0.025)
     position = returns.position_m - late_s * returns.velocity_mps
     turned = Rotation.from_rotvec(-late_s * returns.rate_radps).as_matrix()
