@@ -264,7 +264,7 @@ class Form:
     the height times d, and Eq. 6 leaves out the factor. As d is the sensor's height over the ground by the
     range, the missing term is -2 σ² ln of that height but for what no mount changes. And σ² itself is only
     told by the same returns: with ``bumps``, Eq. 6 / σ² within the passes becomes its logarithm, else
-    what the first solution took the ground's roughness for would hold the beams to the slant of that solution.
+    what the first solution took the roughness for would hold the beams to the slant of that solution.
     """
     ray: Array | None = None
     """(108,) `Scatter.ray` of the ground, where it is rough."""

@@ -258,12 +258,12 @@ SETUP = Setup(
 )
 
 
-def errors_of_many_drives(rig, *setups, seeds=20, passes=12, **of_rig):
+def errors_of_many_drives(rig, *setups, seeds=20, passes=12, grounds=120, **of_rig):
     """The six unknowns' errors in drives with the same pole, but other ground, ways and noise: mm and °."""
     drives = Rig(rig.true, passes=passes, speeds_mps=(1.5, 2.5, -1.0), **of_rig)
     errors = []
     for seed in range(seeds):
-        returns = drive(drives, np.random.default_rng(seed), 60 * passes, 120 * passes)
+        returns = drive(drives, np.random.default_rng(seed), 60 * passes, grounds * passes)
         results = [estimate(passes_of(returns, 30), setup) for setup in setups]
         errors.append([result.mount.vector - rig.true.vector for result in results])
     return np.moveaxis(errors, 1, 0) * [1e3, 1e3, 1e3, *np.degrees([1, 1, 1])]
@@ -319,6 +319,7 @@ def test_a_thick_pole_does_not_look_nearer_where_passes_have_errors_of_their_own
 
 def test_kinds_that_count_by_their_own_scatter_tell_yaw_and_position_better(rig):
     by_kind = replace(SETUP, by_kind=True)
-    without, with_it = errors_of_many_drives(rig, SETUP, by_kind)
-    assert (rms(with_it) < 1.1 * rms(without)).all()
-    assert rms(with_it)[5] < 0.95 * rms(without)[5]
+    without, with_it = (rms(of) for of in errors_of_many_drives(rig, SETUP, by_kind, grounds=1500))
+    assert (with_it < 1.2 * without).all()
+    assert np.linalg.norm(with_it[:2]) < 0.95 * np.linalg.norm(without[:2])
+    assert with_it[5] < 0.7 * without[5]
