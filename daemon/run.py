@@ -34,6 +34,7 @@ from polecal.drivers.port import Direction, Port, Tap
 from polecal.drivers.sick_lms import SickLms
 
 _LOOK_S = 0.5
+_TOGETHER_S = 0.02  # between two looks: waking for each chunk costs more than hearing it
 _PATIENCE_S = 0.3  # a status waits no longer for one that is being calculated
 _WRITE_AGAIN_S = 1.0
 
@@ -279,6 +280,8 @@ class Run:
         """Hear what was recorded until every device is left, and nothing waits."""
         while any(thread.is_alive() for thread in self._threads):
             self._do(self._writer.get(_LOOK_S))
+            if self._writer.all_heard:
+                time.sleep(_TOGETHER_S)
         try:
             self._writer.close()
         except DiskFull as error:  # it is cut off, and repaired at the daemon's next start

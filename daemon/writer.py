@@ -83,6 +83,11 @@ class Writer:
             self._room.release()
         return item
 
+    @property
+    def all_heard(self) -> bool:
+        """Whether all that was written has been taken."""
+        return self._written.empty()
+
     def sync(self) -> None:
         """Wait until all that was handed on is on the disk. Raises RecorderError."""
         if self._thread.is_alive():

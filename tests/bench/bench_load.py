@@ -1,8 +1,8 @@
 """Load: the daemon's share of a core, its memory, and how late its stamps are, at the devices' full rate.
 
-One laser and four, 401 beams at 18.75 Hz and 500 kbaud, INSPVAS at 100 Hz, on pseudo-terminals of a process
-of their own that notes when it wrote each byte. Share and memory are the kernel's account of ``polecald``;
-a stamp's delay is that from a write to the stamp of the chunk that has its first byte. While solving, a pass
+One laser and four, 401 beams at 18.75 Hz and 500 kbaud, INSPVAS at 100 Hz, each on the pseudo-terminal of a
+process that notes when it wrote each byte. Share and memory are the kernel's account of ``polecald``; a
+stamp's delay is that from a write to the stamp of the chunk that has its first byte. While solving, a pass
 is dropped and kept again without a pause. The soak is an hour of passes in virtual time.
 """
 
@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -69,32 +69,32 @@ class _Noted:
         return data
 
 
-def emulate(folder: str, lasers: int) -> None:
-    """Serve devices in this process until its input ends; then write down what was written when."""
-    world, now_ns = demo_world(1), time.monotonic_ns()
-    logs = {f"lms{i}": [] for i in range(lasers)} | {SPAN: []}
-    devices = {
-        f"lms{i}": EmulatedLaser(world, t0_ns=now_ns - 2 * 10**9, eeprom=lms.STREAM_CONFIG, seed=i)
-        for i in range(lasers)
-    } | {SPAN: EmulatedReceiver(world, t0_ns=now_ns, baud=230400, aligned_after_s=-2.0)}
+def emulate(folder: str, name: str, start_ns: int) -> None:
+    """Serve a device until this process's input ends; then write down what was written when.
+
+    The vehicle begins to drive at ``start_ns``.
+    """
+    world, log, now_ns = demo_world(1), [], time.monotonic_ns()
+    world.start(start_ns)
+    device = (
+        EmulatedReceiver(world, t0_ns=now_ns, baud=230400, aligned_after_s=-2.0)
+        if name == SPAN
+        else EmulatedLaser(world, t0_ns=now_ns - 2 * 10**9, eeprom=lms.STREAM_CONFIG, starts_world=False)
+    )
     stop = threading.Event()
-    threads = [  # a thread a device: the scans of one do not hold up another's bytes
-        threading.Thread(
-            target=serve, args=({f"{folder}/{name}": _Noted(device, logs[name])},), kwargs={"stop": stop}
-        )
-        for name, device in devices.items()
-    ]
-    for thread in threads:
-        thread.start()
+    thread = threading.Thread(
+        target=serve, args=({f"{folder}/{name}": _Noted(device, log)},), kwargs={"stop": stop}
+    )
+    thread.start()
     sys.stdin.read()
     stop.set()
-    for thread in threads:
-        thread.join()
-    for name, log in logs.items():
-        stamps = np.array([t_ns for t_ns, _ in log])
-        ends = np.cumsum([len(data) for _, data in log])
-        np.savez(f"{folder}/{name}.npz", stamps=stamps, ends=ends)
-        Path(f"{folder}/{name}.raw").write_bytes(b"".join(data for _, data in log))
+    thread.join()
+    np.savez(
+        f"{folder}/{name}.npz",
+        stamps=np.array([t_ns for t_ns, _ in log]),
+        ends=np.cumsum([len(data) for _, data in log]),
+    )
+    Path(f"{folder}/{name}.raw").write_bytes(b"".join(data for _, data in log))
 
 
 @contextmanager
@@ -158,8 +158,13 @@ def _live(lasers: int) -> Iterator[tuple[str, float, str, str]]:
         folder = Path(place)
         config = folder / "polecal.yaml"
         config.write_text(yaml.safe_dump(_config(folder, lasers)))
-        me = "from tests.bench.bench_load import emulate; import sys; emulate(sys.argv[1], int(sys.argv[2]))"
-        with _program("-c", me, place, str(lasers), stdin=subprocess.PIPE):
+        me = (
+            "import sys; from tests.bench.bench_load import emulate as e; e(*sys.argv[1:3], int(sys.argv[3]))"
+        )
+        start_ns = time.monotonic_ns() + 8 * 10**9
+        with ExitStack() as devices:
+            for name in names:
+                devices.enter_context(_program("-c", me, place, name, str(start_ns), stdin=subprocess.PIPE))
             service = ("-m", "polecal.daemon.service", "--config", str(config))
             with (
                 (folder / "log").open("wb") as log,

@@ -1,0 +1,71 @@
+"""A drive without an end, in virtual time: what the daemon holds does not grow with it."""
+
+import gc
+import tracemalloc
+
+import numpy as np
+
+from polecal.drivers.emulated import laser_telegrams as lms
+from polecal.drivers.emulated.laser import EmulatedLaser
+from polecal.drivers.emulated.receiver import EmulatedReceiver
+from polecal.drivers.emulated.virtual import play
+from polecal.drivers.emulated.world import demo_world
+
+LOGS = (("INSPVASB", 0.05), ("BESTPOSB", 1.0), ("TIMEB", 1.0))
+
+
+class Endless:
+    """The demonstration's drive there and back for ever."""
+
+    def __init__(self, drive):
+        self._drive, self._from_s, self._span_s = drive, 8.0, drive.reverse_from_s - 8.0
+
+    def pose(self, t_s):
+        times, part_s = np.divmod(np.asarray(t_s), self._span_s)
+        back = times % 2 == 1
+        position, rpy, velocity = self._drive.pose(
+            self._from_s + np.where(back, self._span_s - part_s, part_s)
+        )
+        return position, rpy, np.where(back[:, None], -velocity, velocity)
+
+
+def test_memory_is_flat_but_for_the_sums_of_each_pass(begun, settings, t0_ns, tell):
+    """From 70 s on all windows are full but that of the poses' quality: 160 bytes of each of 16384."""
+    world = demo_world(1)
+    world.trajectory, world.nav_error, world.reflectors = Endless(world.trajectory), None, ()
+    laser = EmulatedLaser(world, t0_ns=t0_ns, seed=1)
+    receiver = EmulatedReceiver(world, t0_ns=t0_ns, seed=1)
+    laser.force_stream(t0_ns, lms.Variant(100, 100))
+    receiver.force_logs(t0_ns, LOGS)
+    config = settings(
+        laser={"resolution_deg": 1},
+        navigation={"port": "/dev/span", "rate_hz": 20},
+        routine={"min_passes": 99},
+    )
+    chunks = list(
+        play({"front": laser, "span": receiver}, start_ns=t0_ns, seconds=130.0, chunk_s=0.1, jitter_s=3e-4)
+    )
+    played = begun(config)
+    held_kb, blocks_kb, passes = [], [], []
+    waiting, builder = iter(chunks), played.pipeline._lasers["front"].channel._builder
+    tracemalloc.start()
+    try:
+        for until_s in (70.0, 120.0):
+            for chunk in waiting:
+                played.feed([chunk])
+                if chunk[1] - t0_ns > until_s * 1e9 and not builder.counts()[0]:  # no pass is open
+                    break
+            played.passes.clear()
+            gc.collect()
+            held_kb.append(tracemalloc.get_traced_memory()[0] / 1e3)
+            kept = played.pipeline._lasers["front"].passes
+            blocks = [block for one in kept for block in one.moments.blocks.values()]
+            blocks_kb.append(sum(block.first.nbytes + block.second.nbytes for block in blocks) / 1e3)
+            passes.append(len(kept))
+    finally:
+        tracemalloc.stop()
+    more = passes[1] - passes[0]
+    grown_kb, of_blocks_kb = held_kb[1] - held_kb[0], blocks_kb[1] - blocks_kb[0]
+    tell(f"{more} passes: {grown_kb:.0f} kB more, of which their blocks are {of_blocks_kb:.0f} kB")
+    assert more > 3
+    assert grown_kb - of_blocks_kb < 20 * more + 200
