@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from polecal.calib import Kind, Pass, Returns
+from polecal.calib import CalibrationError, Kind, Pass, Returns
 from polecal.calib.moments import Moments
 from polecal.daemon import config as configuration
 from polecal.daemon import facts, recorder
@@ -33,7 +34,11 @@ from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, Session, Sessio
 _OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "page", "port")
 """Keys of the configuration that may change from day to day."""
 
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, yaml.YAMLError)
+DAMAGE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, CalibrationError),
+    *(zipfile.BadZipFile, zlib.error, yaml.YAMLError),
+)
+"""What numpy, zipfile and PyYAML raise on a file that is damaged, however it is."""
 
 
 def find(state_dir: Path, name: object) -> Path:
@@ -154,7 +159,7 @@ def read_pass(path: Path) -> Kept:
             first_ns, last_ns = file["t_ns"].tolist()
             number = int(path.stem.rpartition("-")[2])
             return Kept(int(file["place"]), (first_ns, last_ns), Pass(number, blocks, site), about, quality)
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
 
 
@@ -182,7 +187,7 @@ def told(folder: Path) -> tuple[dict[str, Any], Config]:
 def _yaml(path: Path) -> dict[str, Any]:
     try:
         content = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
     if not isinstance(content, dict):
         raise SessionError(f"{path}: is not what polecal writes", _REPLAY)

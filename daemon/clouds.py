@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -11,15 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polecal.calib import CalibrationError, Kind, Mount, Returns, points_nav
+from polecal.calib import Kind, Mount, Returns, points_nav
+from polecal.daemon.archive import DAMAGE
 
 _MOST_POINTS = 2400  # of a laser, in each of its two clouds
 _MOST_OF_A_PASS = 80
 _NEEDED = ("range_m", "bearing_rad", "position_m", "rpy_rad", "kind", "pass_id")
-_DAMAGE = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, CalibrationError),
-    *(zipfile.BadZipFile, zlib.error),
-)
 
 
 class Clouds:
@@ -61,7 +56,7 @@ class Clouds:
                 with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                     returns = Returns(**{name: file[name] for name in _NEEDED})
                     site = int(file["site"])
-            except _DAMAGE:
+            except DAMAGE:
                 return None
             pole = returns[returns.kind == Kind.POLE]
             self._thinned[number] = site, _every(pole, _MOST_OF_A_PASS)

@@ -75,16 +75,16 @@ def _lines(status: Mapping[str, Any], width: int) -> list[Text]:
     top = top[: HEIGHT - len(bottom)]
     room = HEIGHT - len(top) - len(bottom)
     notes = _said("! ", _list(status.get("notes")), width, 3, "yellow")
-    ended = status.get("state") in ("accepted", "rejected")
+    state = str(status.get("state"))
     if len(lasers) == 1 and room - len(notes) >= 1 + _ROSE_HEIGHT + _LEAST_TALK:
         middle = _whole(lasers[0], width)
         middle += notes
-        middle += _verdict(lasers[0], ended, width, room - len(middle))
+        middle += _verdict(lasers[0], state, width, room - len(middle))
     else:
         middle = notes[: max(0, room)]
         for number, laser in enumerate(lasers):
             share = (room - len(middle)) // (len(lasers) - number)
-            middle += _brief(laser, ended, width, share)
+            middle += _brief(laser, state, width, share)
     return [*top, *middle, *bottom]
 
 
@@ -264,19 +264,23 @@ def _costs(laser: Mapping[str, Any]) -> list[Text]:
     return lines
 
 
-def _verdict(laser: Mapping[str, Any], ended: bool, width: int, room: int) -> list[Text]:
+def _verdict(laser: Mapping[str, Any], state: str, width: int, room: int) -> list[Text]:
     verdict = _dict(laser.get("verdict"))
     reasons = _list(verdict.get("reasons"))
     if verdict.get("accepted"):
-        return _said("✓ accepted  ", reasons or [""], width, room, "bold green")
+        if state == "accepted":
+            return _said("✓ accepted  ", reasons or [""], width, room, "bold green")
+        met = f"its own criteria are met; the session is {state}"  # another laser's may not be
+        return _said("✓ ", [met], width, room, "")
     dropped = _dict(laser.get("dropped"))
     unused = "not used: " + ", ".join(f"{_count(count)} {reason}" for reason, count in dropped.items())
+    ended = state in ("accepted", "rejected")
     first = "✗ rejected: " if ended else "not yet: "
     lines = _said(first, reasons, width, room, "red" if ended else "") if reasons else []
     return [*lines, *(_said("", [unused], width, room - len(lines), "dim") if dropped else [])]
 
 
-def _brief(laser: Mapping[str, Any], ended: bool, width: int, room: int) -> list[Text]:
+def _brief(laser: Mapping[str, Any], state: str, width: int, room: int) -> list[Text]:
     """Tell of one laser among several, in three lines and its verdict."""
     slices = _list(laser.get("coverage"))
     line = Text(f" {_short(laser.get('name') or NONE, 12)}", style="bold")
@@ -298,7 +302,7 @@ def _brief(laser: Mapping[str, Any], ended: bool, width: int, room: int) -> list
     spark = _spark(_list(laser.get("costs_m")), _SPARKS)
     if spark and room > len(lines) + 1:
         lines.append(Text("   √c    ").append(spark, style="cyan"))
-    return [*lines, *_verdict(laser, ended, width, room - len(lines))][: max(0, room)]
+    return [*lines, *_verdict(laser, state, width, room - len(lines))][: max(0, room)]
 
 
 def _said(mark: str, sentences: Iterable[object], width: int, most: int, style: str) -> list[Text]:

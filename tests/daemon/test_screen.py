@@ -199,6 +199,7 @@ def test_without_an_estimate_there_are_dashes():
         ("collecting", {"accepted": False, "reasons": ["too few passes"]}, "not yet: too few passes"),
         ("rejected", {"accepted": False, "reasons": ["cost 0.2 m"]}, "rejected: cost 0.2 m"),
         ("accepted", {"accepted": True, "reasons": []}, "✓ accepted"),
+        ("rejected", {"accepted": True, "reasons": []}, "its own criteria are met; the session is rejected"),
     ],
 )
 def test_the_verdict_is_in_words(state, verdict, says):

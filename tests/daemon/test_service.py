@@ -361,5 +361,6 @@ def test_killed_it_leaves_a_capture_to_replay_and_told_to_end_a_closed_one(bench
     capture = recorder.read(ended / "capture.mcap")
     events = [item.content for item in capture if isinstance(item, recorder.Event)]
     assert capture.cut is None
-    assert events[-1]["new"] == "idle"
-    assert "stopped" in events[-1]["why"]
+    last = [event for event in events if event["event"] == "state"][-1]
+    assert last["new"] == "idle"
+    assert "stopped" in last["why"]
