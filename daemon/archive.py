@@ -94,11 +94,13 @@ def resume(folder: Path, config: Config) -> tuple[Session, Past]:
 
 def past_of(folder: Path) -> Past:
     """Read what a session's runs left. Raises SessionError."""
+    captures = captures_of(folder)
+    if not captures:
+        raise SessionError(f"{folder}: has no capture", "bring its capture.mcap back")
     passes: dict[str, list[Kept]] = {}
     for path in sorted((folder / "passes").glob("*.npz"), key=lambda each: (len(each.name), each.name)):
         passes.setdefault(path.stem.rpartition("-")[0], []).append(read_pass(path))
     every = {name: sorted({one.where for one in kept}) for name, kept in passes.items()}
-    captures = captures_of(folder)
     content = calibration(folder)
     if content is not None and content.get("captures", 1) == len(captures):
         poles = {
@@ -115,7 +117,7 @@ def past_of(folder: Path) -> Past:
             reference_point=content["lasers"][0].get("reference_point"),
             origin=_origin(content),
         )
-    choices, earlier_poles = _recorded(captures[-1]) if captures else ((), {})
+    choices, earlier_poles = _recorded(captures[-1])
     site = len(captures) - 1
     poles = {
         name: sorted({*earlier_poles.get(name, []), *(where for where in each if where[0] == site)})

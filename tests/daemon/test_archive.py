@@ -186,6 +186,14 @@ def test_with_other_ports_and_folders_it_is(recorded, settings, tmp_path):
     assert len(past.passes["front"]) == len(recorded.played.passes)
 
 
+def test_a_session_whose_capture_was_taken_away_is_not_opened(recorded, tmp_path):
+    folder = tmp_path / "session"
+    shutil.copytree(recorded.session.folder, folder, ignore=shutil.ignore_patterns("*.mcap", "replay"))
+    with pytest.raises(SessionError, match="has no capture") as caught:
+        archive.reopen(folder)
+    assert caught.value.hint == "bring its capture.mcap back"
+
+
 def test_a_pass_is_read_back_as_it_was(recorded):
     past = archive.past_of(recorded.session.folder)
     for read, (_, stored) in zip(past.passes["front"], recorded.played.passes, strict=True):
