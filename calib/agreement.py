@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from polecal.calib.estimate import Pass, Result, Setup
+from polecal.calib.estimate import Pass, Result, Setup, scatter_of
 from polecal.calib.geometry import Array, wrap
-from polecal.calib.observations import Kind, axis_shift_m
-from polecal.calib.solve import EXTRAS, Scatter, pole_rows
+from polecal.calib.observations import Kind
+from polecal.calib.solve import pole_rows
 
 _FLOOR_M = 0.01  # two lasers see the pole at two heights, and no pole is quite straight
 _FALSE_ALARMS = 1e-4
@@ -58,11 +58,8 @@ class View:
             for one, span in zip(passes, spans_ns, strict=True)
             if one.id not in result.set_aside and one.pole_returns
         ]
-        scatter = Scatter(
-            [one.total(Kind.POLE) for one, _ in used], shift_m=axis_shift_m(setup.pole_radius_m), ranged=True
-        )
-        extras = [result.extras.get(of, 0.0) for of in EXTRAS]
-        vector = np.concatenate([result.mount.vector, extras])
+        scatter = scatter_of([one.total(Kind.POLE) for one, _ in used], Kind.POLE, setup.pole_radius_m)
+        vector = result.vector
         place_m = scatter.means(pole_rows(vector))
         steps = _STEP * np.eye(len(vector))[:6]
         moved = [(scatter.means(pole_rows(vector + step)) - place_m) / _STEP for step in steps]

@@ -127,6 +127,11 @@ class Result:
     left_out: dict[int, Array]
     """(6,) m and rad, the mount without a used pass, by its id; empty where there are too few."""
 
+    @property
+    def vector(self) -> Array:
+        """The unknowns (12,) in the order of `solve.UNKNOWNS`, m and rad; 0 where an extra was not told."""
+        return np.concatenate([self.mount.vector, [self.extras.get(name, 0.0) for name in EXTRAS]])
+
 
 def sum_of(blocks: Iterable[Moments]) -> Moments:
     """Add up moments."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polecal.calib.estimate import Pass, Result, Setup
-from polecal.calib.observations import Kind, axis_shift_m
-from polecal.calib.solve import EXTRAS, Scatter, pole_rows
+from polecal.calib.estimate import Pass, Result, Setup, scatter_of
+from polecal.calib.observations import Kind
+from polecal.calib.solve import pole_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +32,8 @@ def residuals(
 
     The common pole is the mean of the ``used`` passes' returns of the same site, as in Eq. 5.
     """
-    scatter = Scatter(
-        [one.total(Kind.POLE) for one in passes], shift_m=axis_shift_m(setup.pole_radius_m), ranged=True
-    )
-    extras = [result.extras.get(name, 0.0) for name in EXTRAS]
-    rows = pole_rows(np.concatenate([result.mount.vector, extras]))
+    scatter = scatter_of([one.total(Kind.POLE) for one in passes], Kind.POLE, setup.pole_radius_m)
+    rows = pole_rows(result.vector)
     means, within = scatter.means(rows), 2 * scatter.within(rows)  # of north and east together
     sites = np.array([one.site for one in passes])
     told: dict[int, Residual | None] = {}

@@ -66,8 +66,7 @@ class Running:
     def __init__(self, passes: Sequence[Pass], setup: Setup, result: Result) -> None:
         used = [one for one in passes if one.id not in result.set_aside]
         self._held = {*result.held, *EXTRAS} - set(result.extras)
-        extras = [result.extras.get(name, 0.0) for name in EXTRAS]
-        self._vector = np.concatenate([result.mount.vector, extras])
+        self._vector = result.vector
         self._radius_m = setup.pole_radius_m
         self._open = {kind: moments.zero() for kind in Kind}
         sites = [one.site for one in used]
