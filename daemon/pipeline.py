@@ -105,8 +105,9 @@ class _LaserRun:
             return  # what was thin from one side has turned out to be a plate, or all were dropped
         with suppress(CalibrationError):
             self.alone = self.result = estimate(passes, self.setup, everywhere=everywhere)
-            spans_ns = [one.facts.gps_ns for one in kept]
-            self.view = View.of(self.name, passes, spans_ns, self.setup, self.result)
+            if len(self._config.lasers) > 1:
+                spans_ns = [one.facts.gps_ns for one in kept]
+                self.view = View.of(self.name, passes, spans_ns, self.setup, self.result)
             # One pass over level ground may put the laser anywhere; what is placed by that is lost.
             if self._could_be(self.result.mount):
                 self.channel.mount = self.result.mount
@@ -525,7 +526,7 @@ class Pipeline:
         """Say what would make better known what is not known well enough, if that is all that is missing."""
         for laser in self._lasers.values():
             if laser.result is not None and any("known to" in why for why in laser.result.verdict.reasons):
-                return f"; {results.weakest(laser.setup, laser.result).drive}"
+                return f"; {results.weakest(laser.setup, laser.result.covariance).drive}"
         return ""
 
     def _notes(self) -> list[str]:
@@ -535,7 +536,7 @@ class Pipeline:
             if result is None or not all(part.done for part in result.slices):
                 continue  # most of it will be told by the passes that are still missing
             if set(result.held) - laser.setup.hold:
-                weak = results.weakest(laser.setup, result)
+                weak = results.weakest(laser.setup, result.covariance)
                 notes.append(f"{laser.name}: {weak.name} is held as measured; to free it: {weak.drive}")
             if "time_s" not in result.extras:
                 notes.append(

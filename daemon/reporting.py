@@ -25,7 +25,6 @@ import yaml
 from polecal import PolecalError, __version__
 from polecal.calib import CalibrationError, Mount, Pass, Returns, estimate
 from polecal.calib.estimate import Setup, split
-from polecal.calib.observability import weak_directions
 from polecal.calib.route import Leg
 from polecal.daemon import archive, recorder, results, route, sessions
 from polecal.daemon import config as configuration
@@ -45,7 +44,6 @@ NAME = "report.html"
 _EVERY_NS = 500_000_000  # of the navigation's many poses
 _LONGEST_S = 500.0
 _NEEDED = ("matplotlib", "jinja2")
-_TELLING = 1e-3  # of the hand measurement's σ: nothing is known better, to say what is known worst
 
 
 class ReportError(PolecalError):
@@ -290,10 +288,7 @@ def _entry(content: Mapping[str, Any], laser: str) -> dict[str, Any]:
 def _to_know_more(setup: Setup, entry: Mapping[str, Any]) -> str:
     if "covariance" not in entry:
         return ""
-    scale = setup.measured_sigma.vector
-    least = np.diag((_TELLING * scale) ** 2)
-    information = np.linalg.inv(np.array(entry["covariance"]) + least)
-    worst = weak_directions(np.asarray(information, dtype=np.float64), scale)[0]
+    worst = results.weakest(setup, np.array(entry["covariance"]))
     return f"what is known worst is {worst.name}; {worst.drive}"
 
 

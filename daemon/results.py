@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polecal.calib import Criteria, Kind, Mount, Need, Result, Setup
@@ -94,11 +95,14 @@ def entry(name: str, setup: Setup, result: Result | None) -> dict[str, Any]:
     }
 
 
-def weakest(setup: Setup, result: Result) -> Direction:
-    """Give the combination of unknowns that is known worst, in the hand measurement's σ: 1 is held."""
+def weakest(setup: Setup, covariance: NDArray[np.float64]) -> Direction:
+    """Give the combination of unknowns that is known worst, in the hand measurement's σ: 1 is held.
+
+    ``covariance`` is a result's, (6, 6), m and rad.
+    """
     scale = setup.measured_sigma.vector
     least = np.diag((_TOLD * scale) ** 2)  # the scatter of few passes is flat in some directions
-    information = np.asarray(np.linalg.inv(result.covariance + least), dtype=np.float64)
+    information = np.asarray(np.linalg.inv(covariance + least), dtype=np.float64)
     return weak_directions(information, scale)[0]
 
 

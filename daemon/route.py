@@ -156,7 +156,7 @@ def _wants_time(laser: LaserStand) -> bool:
     return (
         laser.result is None
         or "time_s" not in laser.result.extras
-        or "reverse" in results.weakest(laser.setup, laser.result).drive
+        or "reverse" in results.weakest(laser.setup, laser.result.covariance).drive
     )
 
 
