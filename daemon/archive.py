@@ -29,7 +29,7 @@ from polecal.daemon.quality import Quality
 from polecal.daemon.recorder import Event, RecorderError
 from polecal.daemon.replay import BEGIN, CHOICE
 from polecal.daemon.routine import State
-from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, Session, SessionError, captures_of
+from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, Session, SessionError, captures_of, folders
 
 _OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "page", "port")
 """Keys of the configuration that may change from day to day."""
@@ -43,12 +43,10 @@ DAMAGE = (
 
 def find(state_dir: Path, name: object) -> Path:
     """Give a session's folder. Raises Refused."""
-    folder = state_dir / "sessions"
-    inside = folder.resolve()
-    there = {path.name for path in folder.glob("*/") if path.resolve().parent == inside}  # no link leads away
-    if not isinstance(name, str) or name not in there:
-        raise Refused(f"there is no session {name}", "see `polecal-field sessions`", Code.USAGE)
-    return folder / name
+    for folder in folders(state_dir):
+        if folder.name == name:
+            return folder
+    raise Refused(f"there is no session {name}", "see `polecal-field sessions`", Code.USAGE)
 
 
 def reopen(folder: Path) -> tuple[Session, Pipeline]:

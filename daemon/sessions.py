@@ -184,22 +184,20 @@ def discard(session: Session) -> None:
         shutil.rmtree(session.folder, ignore_errors=True)
 
 
-def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
-    """Read a session's calibration; the last accepted one's if none is named. Raises SessionError.
+def folders(state_dir: Path) -> list[Path]:
+    """Give the sessions' folders, by name: those that are there, so that no name and no link leads away."""
+    inside = (state_dir / "sessions").resolve()
+    return sorted(path for path in (state_dir / "sessions").glob("*/") if path.resolve().parent == inside)
 
-    A session is one of the folders that are there, so that no name and no link leads anywhere else.
-    """
-    folder = state_dir / "sessions"
-    inside = folder.resolve()
-    files = (path / CALIBRATION for path in folder.glob("*/"))
-    names = sorted(
-        (file.parent.name for file in files if file.is_file() and file.resolve().parent.parent == inside),
-        reverse=True,
-    )
-    if session is not None:
-        names = [name for name in names if name == session]
-    for name in names:
-        content: dict[str, Any] = yaml.safe_load((folder / name / CALIBRATION).read_text(encoding="utf-8"))
+
+def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
+    """Read a session's calibration; the last accepted one's if none is named. Raises SessionError."""
+    inside = (state_dir / "sessions").resolve()
+    for folder in reversed(folders(state_dir)):
+        file = folder / CALIBRATION
+        if session not in (None, folder.name) or not file.is_file() or file.resolve().parent.parent != inside:
+            continue
+        content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
         if session is not None or content["state"] == "accepted":
             return content
     wanted = f"session {session} has no calibration" if session else "no session was accepted yet"
@@ -208,14 +206,11 @@ def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
 
 def folder_of(state_dir: Path, session: str | None) -> Path:
     """Give a session's folder, the last one's if none is named. Raises SessionError."""
-    inside = (state_dir / "sessions").resolve()
-    files = (state_dir / "sessions").glob("*/session.yaml")
-    folders = sorted(path.parent for path in files if path.parent.resolve().parent == inside)
-    folders = [folder for folder in folders if session is None or folder.name == session]
-    if not folders:
-        what = "there is no session yet" if session is None else f"there is no session {session}"
-        raise SessionError(what, f"see {state_dir / 'sessions'}")
-    return folders[-1]
+    for folder in reversed(folders(state_dir)):
+        if session in (None, folder.name) and (folder / "session.yaml").exists():
+            return folder
+    what = "there is no session yet" if session is None else f"there is no session {session}"
+    raise SessionError(what, f"see {state_dir / 'sessions'}")
 
 
 def read_calibration(folder: Path) -> dict[str, Any]:
