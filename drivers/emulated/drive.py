@@ -153,6 +153,22 @@ class Drive:
         return self._ground.body(north, east, yaw, speed)
 
 
+class ThereAndBack:
+    """A part of a motion, from ``begin_s`` to ``end_s``, gone through forwards and backwards for ever."""
+
+    def __init__(self, trajectory: Trajectory, begin_s: float, end_s: float) -> None:
+        self._trajectory, self._begin_s, self._span_s = trajectory, begin_s, end_s - begin_s
+
+    def pose(self, t_s: ArrayLike) -> tuple[Floats, Floats, Floats]:
+        """Return position (N, 3) m, roll pitch yaw (N, 3) rad and velocity (N, 3) m/s at times (N,) s."""
+        times, part_s = np.divmod(np.asarray(t_s, np.float64), self._span_s)
+        back = times % 2 == 1
+        position_m, rpy_rad, velocity_mps = self._trajectory.pose(
+            self._begin_s + np.where(back, self._span_s - part_s, part_s)
+        )
+        return position_m, rpy_rad, np.where(back[:, None], -velocity_mps, velocity_mps)
+
+
 def _turn(radius_m: float) -> Floats:
     """Return a turn to the right by the heading step, from the origin northward, as (N, 4): s, n, e, heading.
 

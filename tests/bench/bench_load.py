@@ -28,6 +28,7 @@ from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Record, Recorder
 from polecal.daemon.sessions import CAPTURE
 from polecal.drivers.emulated import laser_telegrams as lms
+from polecal.drivers.emulated.drive import ThereAndBack
 from polecal.drivers.emulated.laser import EmulatedLaser
 from polecal.drivers.emulated.receiver import EmulatedReceiver
 from polecal.drivers.emulated.serve import serve
@@ -243,25 +244,10 @@ def _delays_ms(folder: Path, capture: Path, names: list[str]) -> dict:
 # --- an hour in virtual time
 
 
-class _Endless:
-    """A drive that is gone through forwards and backwards, for ever."""
-
-    def __init__(self, drive, begin_s: float, end_s: float):
-        self._drive, self._begin_s, self._span_s = drive, begin_s, end_s - begin_s
-
-    def pose(self, t_s):
-        times, part_s = np.divmod(np.asarray(t_s), self._span_s)
-        back = times % 2 == 1
-        position, rpy, velocity = self._drive.pose(
-            self._begin_s + np.where(back, self._span_s - part_s, part_s)
-        )
-        return position, rpy, np.where(back[:, None], -velocity, velocity)
-
-
 def _soak() -> Iterator[tuple[str, float, str, str]]:
     """An hour's passes through pipeline and recorder; memory is this process's own."""
     world = demo_world(1)
-    world.trajectory = _Endless(world.trajectory, 8.0, world.trajectory.reverse_from_s)
+    world.trajectory = ThereAndBack(world.trajectory, 8.0, world.trajectory.reverse_from_s)
     world.nav_error = None
     t0_ns = 10**12
     laser = EmulatedLaser(world, t0_ns=t0_ns, seed=1)

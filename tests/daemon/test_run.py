@@ -153,14 +153,21 @@ def fill(path):
             file.write(bytes(1 << 14))
 
 
-def test_a_full_disk_stops_recording_keeps_all_that_is_known_and_goes_on_when_there_is_room(
-    bench, begin, until, small_disk
-):
+@pytest.fixture
+def on_full_disk(bench, begin, until, small_disk):
+    """A disk that was filled once the pole had been passed, and the run that records on it."""
     disk = small_disk("24m")
     run = begin(bench, state_dir=disk, storage=Storage(min_free_mb=1))
     until(lambda: run.status()["lasers"][0]["passes"] == 1)
     with pytest.raises(OSError, match="No space"):
         fill(disk / "filler")
+    return disk, run
+
+
+def test_a_full_disk_stops_recording_keeps_all_that_is_known_and_goes_on_when_there_is_room(
+    on_full_disk, bench, until
+):
+    disk, run = on_full_disk
     until(lambda: any("nothing is recorded" in note for note in run.status()["notes"]))
     assert run.state is State.COLLECTING
     assert run.status()["lasers"][0]["estimate"] is not None
@@ -243,13 +250,9 @@ def test_stopping_does_not_wait_for_devices_that_are_gone(bench, begin, until):
 
 
 def test_an_end_on_a_full_disk_is_no_fault_and_its_result_is_written_once_there_is_room(
-    bench, begin, until, small_disk
+    on_full_disk, bench, until
 ):
-    disk = small_disk("24m")
-    run = begin(bench, state_dir=disk, storage=Storage(min_free_mb=1))
-    until(lambda: run.status()["lasers"][0]["passes"] == 1)
-    with pytest.raises(OSError, match="No space"):
-        fill(disk / "filler")
+    disk, run = on_full_disk
     until(lambda: run._writer.full is not None)
     run.stop("asked to stop", calibrate=True)
     assert run.state is State.REJECTED

@@ -3,9 +3,8 @@
 import gc
 import tracemalloc
 
-import numpy as np
-
 from polecal.drivers.emulated import laser_telegrams as lms
+from polecal.drivers.emulated.drive import ThereAndBack
 from polecal.drivers.emulated.laser import EmulatedLaser
 from polecal.drivers.emulated.receiver import EmulatedReceiver
 from polecal.drivers.emulated.virtual import play
@@ -14,25 +13,11 @@ from polecal.drivers.emulated.world import demo_world
 LOGS = (("INSPVASB", 0.05), ("BESTPOSB", 1.0), ("TIMEB", 1.0))
 
 
-class Endless:
-    """The demonstration's drive there and back for ever."""
-
-    def __init__(self, drive):
-        self._drive, self._from_s, self._span_s = drive, 8.0, drive.reverse_from_s - 8.0
-
-    def pose(self, t_s):
-        times, part_s = np.divmod(np.asarray(t_s), self._span_s)
-        back = times % 2 == 1
-        position, rpy, velocity = self._drive.pose(
-            self._from_s + np.where(back, self._span_s - part_s, part_s)
-        )
-        return position, rpy, np.where(back[:, None], -velocity, velocity)
-
-
 def test_memory_is_flat_but_for_the_sums_of_each_pass(begun, settings, t0_ns, tell):
     """From 70 s on all windows are full but that of the poses' quality: 160 bytes of each of 16384."""
     world = demo_world(1)
-    world.trajectory, world.nav_error, world.reflectors = Endless(world.trajectory), None, ()
+    world.trajectory = ThereAndBack(world.trajectory, 8.0, world.trajectory.reverse_from_s)
+    world.nav_error, world.reflectors = None, ()
     laser = EmulatedLaser(world, t0_ns=t0_ns, seed=1)
     receiver = EmulatedReceiver(world, t0_ns=t0_ns, seed=1)
     laser.force_stream(t0_ns, lms.Variant(100, 100))
