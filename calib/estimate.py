@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from polecal.calib import consistency, moments, solve
 from polecal.calib.acceptance import Criteria, Verdict, judge
 from polecal.calib.blas import one_thread
+from polecal.calib.certificate import Certificate, certify
 from polecal.calib.coverage import Need, Slice, coverage, slice_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
@@ -126,6 +127,8 @@ class Result:
     verdict: Verdict
     left_out: dict[int, Array]
     """(6,) m and rad, the mount without a used pass, by its id; empty where there are too few."""
+    certificate: Certificate | None = None
+    """Whether the cost is proven to be the lowest; None where only the next minimum was sought."""
 
     @property
     def vector(self) -> Array:
@@ -259,7 +262,8 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
             break
         set_aside[passes[odd[0]].id] = odd[1]
         used[odd[0]] = False
-    return problem.result(used, found, set_aside)
+    result = problem.result(used, found, set_aside)
+    return replace(result, certificate=problem.certify(used, found)) if everywhere else result
 
 
 def scatter_of(
@@ -443,6 +447,10 @@ class _Problem:
             if found.left_out is None
             else {one.id: row[:6] for one, row in zip(passes, found.left_out, strict=True)},
         )
+
+    def certify(self, used: NDArray[np.bool_], found: _Found) -> Certificate:
+        """Say whether what was found is proven to be the lowest minimum, its weights and extras given."""
+        return certify(self._form(used, found.weights), found.vector, found.held)
 
     def _minimum_of(self, numbers: Sequence[int], found: _Found) -> Array:
         """Find the minimum of some passes, what is held and how they weigh as in ``found``."""

@@ -24,9 +24,11 @@ EXTRAS = ("time_s", "range_m", "lean_north", "lean_east", "slope_north", "slope_
 UNKNOWNS = (*PARAMETERS, *EXTRAS)
 """The order of every vector (12,) here: m, rad, s, m and pure numbers."""
 
+CLEARLY = 0.995
+"""Of √c: what is not lower than that is as low. On flat ground the mirror image is, but for the noise."""
+
 _STEPS = 100
 _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
-_CLEARLY = 0.995  # of √c: on flat ground the mirror image is as good, but for the noise
 _NOTHING = 1e-15
 _DESCENTS = 40
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
@@ -325,6 +327,23 @@ class Form:
         )
         return pole[1] + self.balance * told
 
+    def in_h(self, vector: Array) -> Array:
+        """Give the form (10, 10) of h that `spread` is at the extras of ``vector`` (12,)."""
+        base, q = _h_base(vector), np.zeros((10, 10))
+        rows = [(self.pole, 1.0, weight) for weight in _pole_weights(vector)[0]]
+        rows += [(self.ground, self.balance, weight) for weight in _ground_weights(vector)[0]]
+        for matrix, counts, weight in rows:
+            part = np.kron(weight[:, None], base)
+            q += counts * (part.T @ matrix @ part)
+        return q
+
+    def height_in_h(self, vector: Array) -> Array | None:
+        """Give what of h (10,) is the sensor's height over rough ground at the extras of ``vector`` (12,)."""
+        if self.ray is None:
+            return None
+        height: Array = self.ray @ np.kron(_ground_weights(vector)[0].T, _h_base(vector))
+        return height
+
     def _half_slopes(self, vector: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], Array | None]:
         """Give `_half_slope` of both kinds, and on rough ground the derivative (12,) of ln of its height."""
         h = _h(vector)
@@ -416,7 +435,7 @@ def minimise_globally(form: Form, start: Array, held: Collection[str] = ()) -> A
     if set(held) & {"roll", "pitch", "yaw"}:
         return near
     lowest = minimise(form, _lowest_rotation(form, start, held), held)
-    if cost_m(form, lowest) > _CLEARLY * cost_m(form, near):
+    if cost_m(form, lowest) > CLEARLY * cost_m(form, near):
         return near
     lowest[3:6] = roll_pitch_yaw(rotation(lowest[3:6]))  # one of the two triples that mean the same rotation
     return lowest
@@ -428,16 +447,7 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
     With the position eliminated c is a form in u = [first column of Csb, second, 1] alone, (7, 7): Newton's
     way on SO(3), damped, R exp([δ]×), for all rotations in one array.
     """
-    base = np.zeros((WIDTH, 10))  # h⁺ of h, at these extras
-    base[BASE] = np.eye(10)
-    base[RANGE, :6] = start[7] * np.eye(6)
-    base[TIME], base[TIME_SQUARED] = start[6] * np.eye(10), start[6] ** 2 * np.eye(10)
-    rows = [(form.pole, 1.0, weight) for weight in _pole_weights(start)[0]]
-    rows += [(form.ground, form.balance, weight) for weight in _ground_weights(start)[0]]
-    q = np.zeros((10, 10))
-    for matrix, counts, weight in rows:
-        part = np.kron(weight[:, None], base)
-        q += counts * (part.T @ matrix @ part)
+    q = form.in_h(start)
     free = [6 + axis for axis in range(3) if UNKNOWNS[axis] not in held]
     known = np.zeros((10, 7))
     known[:6, :6] = np.eye(6)
@@ -487,6 +497,15 @@ def _h(vector: Array) -> Array:
     columns = rotation(vector[3:6])[:, :2].T.ravel()
     h = np.concatenate([columns, vector[:3], [1.0]])
     return np.concatenate([h, range_m * columns, time_s * h, time_s**2 * h])
+
+
+def _h_base(vector: Array) -> Array:
+    """Give what turns h into h⁺ at the extras of ``vector`` (12,): (36, 10)."""
+    base = np.zeros((WIDTH, 10))
+    base[BASE] = np.eye(10)
+    base[RANGE, :6] = vector[7] * np.eye(6)
+    base[TIME], base[TIME_SQUARED] = vector[6] * np.eye(10), vector[6] ** 2 * np.eye(10)
+    return base
 
 
 def _h_gradient(vector: Array, h: Array) -> Array:

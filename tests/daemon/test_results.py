@@ -66,6 +66,12 @@ def test_every_key_of_the_interface_is_there(content, laser, early):
     assert laser["returns"].keys() == {"pole", "ground"}
 
 
+def test_a_run_that_has_ended_tells_whether_its_minimum_is_proven_to_be_the_lowest(laser, early):
+    assert laser["lowest"]["proven"] is True
+    assert 0 <= laser["lowest"]["lower_by"] < 0.005
+    assert early["lowest"] is None
+
+
 def test_before_a_pass_there_is_no_number_and_a_reason(early):
     assert early["estimate"] is early["sigma"] is early["cost_m"] is early["measured_cost_m"] is None
     assert early["passes"] == 0

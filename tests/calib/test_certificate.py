@@ -1,0 +1,113 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from polecal.calib import Mount, Setup, estimate
+from polecal.calib.certificate import certify
+from polecal.calib.estimate import passes_of, scatter_of
+from polecal.calib.geometry import roll_pitch_yaw
+from polecal.calib.observations import Kind
+from polecal.calib.report.rig import Rig, drive
+from polecal.calib.solve import EXTRAS, Form, Weights, cost_m, minimise, minimise_globally
+
+TRUE = Mount(-0.029, -0.36, -0.996, -0.528, -8.182, -2.017)
+START = np.concatenate([[0.0, -0.35, -1.0], np.radians([0.0, -8.0, 0.0]), np.zeros(6)])
+RIG = Rig(TRUE, passes=24, speeds_mps=(1.5, 2.5, -1.0), rough_m=0.05)
+
+
+@pytest.fixture(scope="module")
+def passes():
+    return passes_of(drive(RIG, np.random.default_rng(0), 1500, 6000), 30)
+
+
+def form_of(passes, **told):
+    pole, ground = (scatter_of([one.total(kind) for one in passes], kind, 0.04) for kind in Kind)
+    used = np.ones(len(passes), dtype=bool)
+    asked = {"pass_error": True, "rough": True, "by_kind": False} | told
+    weights = Weights.told(pole, ground, used, START, **asked)
+    forms = (pole.form(used, weights.pole_ratio), ground.form(used, weights.ground_ratio))
+    bumps = ground.within_form(used) if weights.ground_return else None
+    balance = weights.balance(pole.count.sum(), ground.count.sum())
+    return Form(*forms, weights.rough_m2, ground.ray(used) if weights.rough_m2 else None, bumps, balance)
+
+
+def turned_at_random(vector, rng):
+    rpy = roll_pitch_yaw(Rotation.random(random_state=rng).as_matrix())
+    position = vector[:3] + rng.normal(size=3)
+    return np.concatenate([position, rpy, vector[6:]])
+
+
+def test_the_lowest_minimum_of_a_drive_over_rough_ground_is_proven_and_no_mount_is_below_its_bound(passes):
+    form, rng = form_of(passes), np.random.default_rng(1)
+    assert form.ray is not None, "and the correction for it is in what is minimised"
+    found = minimise_globally(form, START)
+    told = certify(form, found)
+    assert told.proven
+    bound_m2 = form.cost(found) - (1 - (1 - told.lower_by) ** 2) * form.spread(found)
+    higher = 0
+    for _ in range(100):
+        other = turned_at_random(found, rng)
+        assert form.cost(other) > bound_m2
+        ended = minimise(form, other, EXTRAS)
+        assert form.cost(ended) > bound_m2
+        if form.cost(ended) > form.cost(found) + 1e-4:
+            higher += 1
+            assert not certify(form, ended).proven
+    assert higher > 10
+
+
+@pytest.mark.parametrize(
+    ("held", "proven"),
+    [
+        (("x", "z"), True),
+        (("x", "y", "z"), True),
+        (("roll", "pitch"), True),
+        (("x", "roll", "pitch"), True),
+        (("roll", "pitch", "yaw"), True),
+        (("yaw",), False),
+        (("roll",), False),
+    ],
+)
+def test_what_is_held_is_held_in_the_proof_too(passes, held, proven):
+    form = form_of(passes)
+    found = minimise_globally(form, START, (*held, *EXTRAS))
+    told = certify(form, found, (*held, *EXTRAS))
+    assert told.proven == proven
+    assert (told.lower_by < 0.01) == proven
+
+
+def test_the_wrong_way_round_is_not_the_lowest_where_roll_and_pitch_are_held(passes):
+    form, held = form_of(passes), ("roll", "pitch", *EXTRAS)
+    best = minimise(form, START, held)
+    turned = minimise(form, best + np.pi * np.eye(12)[5], held)
+    turned_back = best + np.pi * np.eye(12)[5]  # no minimum either, but one may ask
+    assert certify(form, best, held).proven
+    assert not certify(form, turned_back, held).proven
+    assert cost_m(form, turned) == pytest.approx(cost_m(form, best)), "there is but one"
+
+
+def test_nothing_is_proven_where_the_roughness_itself_is_sought_or_the_sensor_is_in_the_ground(passes):
+    by_kind = form_of(passes, by_kind=True)
+    assert by_kind.bumps is not None
+    assert not certify(by_kind, minimise(by_kind, START)).proven
+    form = form_of(passes)
+    buried = replace(form, ray=np.zeros_like(form.ray))
+    assert not certify(buried, START).proven
+
+
+def test_a_perfect_fit_is_the_lowest(rig):
+    passes = passes_of(rig.drive(), 30)
+    pole, ground = (scatter_of([one.total(kind) for one in passes], kind, 0.0) for kind in Kind)
+    every = np.ones(len(passes), dtype=bool)
+    form = Form(pole.form(every), ground.form(every))
+    found = minimise_globally(form, START, EXTRAS)
+    assert cost_m(form, found) < 1e-3
+    assert certify(form, found).proven
+
+
+def test_the_proof_is_in_a_result_that_was_sought_everywhere(passes):
+    setup = Setup(Mount.from_vector(START[:6]), pole_radius_m=0.04)
+    assert estimate(passes, setup).certificate is None
+    assert estimate(passes, setup, everywhere=True).certificate.proven
