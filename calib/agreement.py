@@ -8,13 +8,13 @@ What a mount has taken into itself to make its passes agree, as x does a late st
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from polecal.calib.estimate import Pass, Result, Setup, scatter_of
 from polecal.calib.geometry import Array, wrap
@@ -124,7 +124,7 @@ def _allowed(apart_m: Array, scatter: Array, moved: Sequence[Array], views: Sequ
     for of, view in zip(moved, views, strict=True):
         allowed += of @ view.covariance @ of.T
     square = float(apart_m @ np.linalg.solve(allowed, apart_m))
-    most = float(chdtri(2, _FALSE_ALARMS))
+    most = -2.0 * math.log(_FALSE_ALARMS)  # χ² of two unknowns
     if square <= most:
         return ""
     return f"their σ allow {np.linalg.norm(apart_m) * np.sqrt(most / square):.3f} m"

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from polecal.calib.acceptance import Jump
 from polecal.calib.geometry import Array, wrap
 from polecal.calib.observations import PARAMETERS
 from polecal.calib.solve import Scatter, Weights, ground_rows, pole_rows
+from polecal.calib.student import exceeded
 
 _FEWEST = 8
 _FEWEST_BEFORE = 3  # what came just before the end is what is true now: there a single pass counts
@@ -52,8 +52,8 @@ def jump(left_out: Array) -> Jump | None:
     spread[:, 3:6] = wrap(spread[:, 3:6])
     say = (1 - passes) * (spread - spread.mean(axis=0))
     splits = range(_FEWEST_BEFORE, passes)
-    most = -stdtrit(passes - 2, _FALSE_ALARMS / 2 / len(splits) / len(PARAMETERS))
-    found, worst = None, float(most)
+    most = exceeded(_FALSE_ALARMS / len(splits) / len(PARAMETERS), passes - 2)
+    found, worst = None, most
     for split in splits:
         before, after = say[:split], say[split:]
         by = after.mean(axis=0) - before.mean(axis=0)

@@ -58,6 +58,30 @@ def roll_pitch_yaw(matrix: Array) -> Array:
     )
 
 
+def turning(vector_rad: Array) -> Array:
+    """Give the rotations (..., 3, 3) about vectors (..., 3) by their lengths in rad (Rodrigues)."""
+    angle_rad = np.linalg.norm(vector_rad, axis=-1)[..., None, None]
+    across = skew(vector_rad)
+    turned: Array = (
+        np.eye(3)
+        + np.sinc(angle_rad / np.pi) * across
+        + np.sinc(angle_rad / (2 * np.pi)) ** 2 / 2 * (across @ across)
+    )
+    return turned
+
+
+def quaternion_xyzw(matrix: Array) -> Array:
+    """Give the quaternion (4,) of a rotation (3, 3); w is not negative."""
+    # Each column of 4 q qᵀ is q but for its length; the longest has the most digits.
+    products = np.empty((4, 4))
+    products[:3, :3] = matrix + matrix.T + (1.0 - np.trace(matrix)) * np.eye(3)
+    products[:3, 3] = products[3, :3] = (matrix.T - matrix)[[1, 2, 0], [2, 0, 1]]
+    products[3, 3] = 1.0 + np.trace(matrix)
+    column = products[:, int(np.argmax(np.diag(products)))]
+    quaternion: Array = np.copysign(1.0, column[3]) * column / np.linalg.norm(column)
+    return quaternion
+
+
 def skew(vector: Array) -> Array:
     """Give the matrix (..., 3, 3) that crosses with ``vector`` (..., 3) from the left."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
@@ -79,3 +103,17 @@ def _matrices(entries: tuple[Array, ...]) -> Array:
 
 
 _SPIN = skew(np.eye(3))
+
+
+def _icosahedral() -> Array:
+    """Turn the 12 ways that also turn a tetrahedron, after each of the 5 about a corner at (0, 1, φ)."""
+    cycled = np.stack([np.roll(np.eye(3), by, axis=0) for by in range(3)])
+    halves = np.stack([np.diag(signs) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))])
+    corner = np.array([0.0, 1.0, (1 + math.sqrt(5)) / 2])
+    fifths = turning(np.arange(5)[:, None] * (math.tau / 5) * corner / np.linalg.norm(corner))
+    turns: Array = (cycled[:, None, None] @ halves[:, None] @ fifths).reshape(-1, 3, 3)
+    return turns
+
+
+ICOSAHEDRAL = _icosahedral()
+"""The 60 rotations (60, 3, 3) that leave an icosahedron as it was: evenly spread over all rotations."""

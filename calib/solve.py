@@ -13,9 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from polecal.calib.geometry import Array, roll_pitch_yaw, rotation, rotation_gradient, skew
+from polecal.calib.geometry import (
+    ICOSAHEDRAL,
+    Array,
+    roll_pitch_yaw,
+    rotation,
+    rotation_gradient,
+    skew,
+    turning,
+)
 from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments
 from polecal.calib.observations import PARAMETERS
 
@@ -456,7 +463,7 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
     whole = known.copy()
     whole[free] += to_position
     q7 = whole.T @ q @ whole
-    turns = rotation(start[3:6]) @ Rotation.create_group("I").as_matrix()
+    turns = rotation(start[3:6]) @ ICOSAHEDRAL
     cost, damping = _cost7(q7, turns), np.full(len(turns), 1e-3)
     for _ in range(_DESCENTS):
         u = _u(turns)
@@ -467,7 +474,7 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
         hessian = np.einsum("bik,bil->bkl", jacobian, pulled)
         scale = np.trace(hessian, axis1=1, axis2=2) + 1e-300
         step = -np.linalg.solve(hessian + (damping * scale)[:, None, None] * np.eye(3), gradient[:, :, None])
-        turned = turns @ Rotation.from_rotvec(step[:, :, 0]).as_matrix()
+        turned = turns @ turning(step[:, :, 0])
         lower = _cost7(q7, turned)
         better = lower < cost
         turns[better], cost = turned[better], np.minimum(cost, lower)

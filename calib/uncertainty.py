@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtri
 
 from polecal.calib.geometry import Array, wrap
 
@@ -35,6 +34,8 @@ def reach(passes: int, unknowns: int = 1, level: float = 0.95) -> float:
     So few passes know their own scatter badly: of one unknown Student's t of P-1, of n together, whose
     √(dᵀ C⁻¹ d) it bounds, Hotelling's T² (n at most P-1, else there is no such region, and it is infinite).
     """
+    from scipy.special import fdtri  # noqa: PLC0415 - 17 MB, and the daemon does not ask for it
+
     left = passes - unknowns
     if left < 1:
         return np.inf

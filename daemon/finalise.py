@@ -34,7 +34,6 @@ from mcap.writer import CompressionType, Writer
 
 from polecal import PolecalError, __version__
 from polecal.daemon import recorder, reporting
-from polecal.daemon.decoded import Decoder
 from polecal.daemon.recorder import METADATA, RecorderError
 from polecal.daemon.sessions import CAPTURES, captures_of
 
@@ -184,6 +183,8 @@ def _decoding(
     if leave_bytes is None:
         yield lambda _: 0
         return
+    from polecal.daemon.decoded import Decoder  # noqa: PLC0415 - 27 MB, which only the child is to take
+
     folder, taken = capture.path.parent, count(1)
 
     def decode(item: recorder.Record | recorder.Event | None) -> int:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from polecal.calib import Criteria, Kind, Mount, Need, Result, Setup
+from polecal.calib.geometry import quaternion_xyzw
 from polecal.calib.observability import Direction, weak_directions
 from polecal.daemon.config import Config, Laser
 
@@ -115,7 +115,7 @@ def calibration(name: str, setup: Setup, result: Result, session: str, created: 
     matrix[:3, 3] = result.mount.vector[:3]
     return entry(name, setup, result) | {
         "frame": FRAME,
-        "quaternion_xyzw": Rotation.from_matrix(result.mount.rotation).as_quat(canonical=True).tolist(),
+        "quaternion_xyzw": quaternion_xyzw(result.mount.rotation).tolist(),
         "matrix": matrix.tolist(),
         "covariance": result.covariance.tolist(),
         "returns": {kind.name.lower(): result.returns[kind] for kind in Kind},

@@ -29,3 +29,9 @@ def test_wheel_holds_every_module_of_the_tree(tmp_path):
 def test_status_command_starts_without_numpy():
     code = "import sys, polecal.daemon.field; sys.exit('numpy' in sys.modules or 'scipy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, env=os.environ)
+
+
+def test_daemon_holds_nothing_that_only_reports_or_exports_need():
+    spared = "{'scipy', 'matplotlib', 'jinja2', 'google'}"
+    code = f"import sys, polecal.daemon.service; sys.exit(' '.join({spared} & set(sys.modules)) or 0)"
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ)

@@ -2,8 +2,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from polecal.calib.geometry import roll_pitch_yaw, rotation, rotation_gradient, skew, wrap
+from polecal.calib.geometry import (
+    ICOSAHEDRAL,
+    quaternion_xyzw,
+    roll_pitch_yaw,
+    rotation,
+    rotation_gradient,
+    skew,
+    turning,
+    wrap,
+)
 
 angles = st.floats(-1.5, 1.5)
 
@@ -47,3 +57,30 @@ def test_skew_crosses():
 @pytest.mark.parametrize(("angle", "wrapped"), [(3 * np.pi / 2, -np.pi / 2), (-np.pi, -np.pi), (0.1, 0.1)])
 def test_wrap_takes_the_short_way(angle, wrapped):
     assert wrap(np.array([angle]))[0] == pytest.approx(wrapped)
+
+
+@given(st.tuples(*[st.floats(-7, 7)] * 3))
+def test_turning_and_its_quaternion_are_those_of_scipy(vector):
+    theirs = Rotation.from_rotvec(vector)
+    np.testing.assert_allclose(turning(np.array(vector)), theirs.as_matrix(), atol=1e-14)
+    ours = quaternion_xyzw(theirs.as_matrix())
+    assert abs(ours @ theirs.as_quat()) == pytest.approx(1.0, abs=1e-14)
+    assert ours[3] >= 0
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_half_a_turn_has_a_quaternion_too(axis):
+    about = np.pi * np.eye(3)[axis]
+    np.testing.assert_allclose(np.abs(quaternion_xyzw(turning(about))), np.eye(4)[axis], atol=1e-15)
+
+
+def test_an_icosahedrons_rotations_are_a_group_of_60_evenly_apart():
+    every = ICOSAHEDRAL.reshape(60, 9)
+    np.testing.assert_allclose(
+        ICOSAHEDRAL @ ICOSAHEDRAL.swapaxes(1, 2), np.tile(np.eye(3), (60, 1, 1)), atol=1e-14
+    )
+    np.testing.assert_allclose(np.linalg.det(ICOSAHEDRAL), 1.0)
+    products = (ICOSAHEDRAL[:, None] @ ICOSAHEDRAL).reshape(3600, 1, 9)
+    assert (np.abs(products - every).max(axis=2).min(axis=1) < 1e-12).all()
+    apart = np.abs(every[:, None] - every).max(axis=2) + np.eye(60)
+    assert apart.min() > 0.1
