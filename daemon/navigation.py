@@ -243,12 +243,13 @@ class Navigation:
         t_ns = frame.t_first_ns
         if (status := frame.time_status) is not None and status != TimeStatus.SATTIME:
             self._time_status = t_ns, status
-        if frame.message_id in _LOGS_BESIDE:
+        message = frame.message_id
+        if message in _LOGS_BESIDE:
             self._note(t_ns, parse(frame))
         pose = nav_state(frame)
         if pose is None:
             return
-        if frame.message_id != MessageId.INSPVAX:
+        if message != MessageId.INSPVAX:
             self._plain_ns = t_ns
         elif self._plain_ns and t_ns - self._plain_ns < _SILENT_NS:
             return  # it came for its standard deviations

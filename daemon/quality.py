@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from polecal.drivers.novatel_span import Accuracy, InsStatus, PositionType
 
@@ -33,8 +34,7 @@ class Quality:
     utc_offset_s: float = UTC_OFFSET_S
 
 
-@dataclass(frozen=True, slots=True)
-class _Pose:
+class _Pose(NamedTuple):
     gps_ns: int
     used: bool
     ins_status: InsStatus | int

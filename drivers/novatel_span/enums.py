@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import TypeVar
+from functools import cache
+from typing import Any, TypeVar
 
 E = TypeVar("E", bound=IntEnum)
 
@@ -13,10 +14,13 @@ NAMELESS = -1
 
 def named(kind: type[E], value: int) -> E | int:
     """Return the member of ``kind`` with that value, or the number itself where the sheet has no name."""
-    try:
-        return kind(value)
-    except ValueError:
-        return value
+    member: E | int = _members(kind).get(value, value)
+    return member
+
+
+@cache
+def _members(kind: type[IntEnum]) -> dict[int, Any]:
+    return {int(member): member for member in kind}
 
 
 class MessageId(IntEnum):

@@ -20,11 +20,13 @@ frame costs no frame behind it.
 from __future__ import annotations
 
 import re
+import struct
 import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from polecal.drivers.novatel_span.enums import MessageId, TimeStatus, named
 
@@ -55,7 +57,7 @@ class Kind(Enum):
     @property
     def checked(self) -> bool:
         """Whether such a frame carries a checksum."""
-        return self not in (Kind.ABBREVIATED, Kind.REPLY, Kind.PROMPT)
+        return self not in _UNCHECKED_KINDS
 
 
 class Fault(Enum):
@@ -77,8 +79,7 @@ class Skip:
     reason: Fault
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):  # as `NavState` is
     """One whole frame, as it was on the wire.
 
     offset: of its first byte in the stream. t_first_ns, t_last_ns: stamps (CLOCK_MONOTONIC) of the chunks
@@ -188,6 +189,9 @@ class Frame:
         Message id, measurement source, sequence number, week, ms.
         """
         source = sequence = 0
+        if self.kind is Kind.SHORT_BINARY:  # as below, in half the time
+            message, week, ms = _SHORT_KEY.unpack_from(self.data, 4)
+            return message, source, sequence, week, ms
         if self.kind is Kind.BINARY:
             source, sequence = self.data[6] & SOURCE_MASK, int.from_bytes(self.data[10:12], "little")
         elif self.kind is Kind.ASCII:
@@ -207,6 +211,8 @@ class Frame:
 
 BINARY_KINDS = frozenset({Kind.BINARY, Kind.SHORT_BINARY, Kind.PROPRIETARY})
 _ASCII_KINDS = frozenset({Kind.ASCII, Kind.SHORT_ASCII})
+_UNCHECKED_KINDS = frozenset({Kind.ABBREVIATED, Kind.REPLY, Kind.PROMPT})
+_SHORT_KEY = struct.Struct("<HHI")  # id, week, ms of a short header, from its fifth byte on
 
 
 def crc32(data: bytes) -> int:
