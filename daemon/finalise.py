@@ -156,7 +156,8 @@ def _rewrite(capture: recorder.Capture, file: IO[bytes], leave_bytes: int | None
     channels: dict[int, int] = {}
     digest, copied = hashlib.sha256(), 0
     with _decoding(capture, writer, leave_bytes) as decode:
-        for channel, message, item in capture.messages():
+        for channel, body, item in capture.messages():
+            message = recorder.message_of(body)
             if channel.id not in channels:
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, 0)
             writer.add_message(
@@ -211,8 +212,8 @@ def _decoding(
 
 def _digest(capture: recorder.Capture) -> bytes:
     digest = hashlib.sha256()
-    for channel, message, _ in capture.messages():
-        digest.update(_identity(channel, message))
+    for channel, body, _ in capture.messages():
+        digest.update(_identity(channel, recorder.message_of(body)))
     return digest.digest()
 
 

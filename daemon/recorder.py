@@ -8,18 +8,17 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Literal, Self, cast
+from typing import IO, Any, Literal, NamedTuple, Self, TypeVar, cast
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Message, Metadata
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
@@ -37,6 +36,9 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAME_ONE = "name a capture.mcap of polecal"
 
 Direction = Literal["rx", "tx"]
+_Line = tuple[str, Direction]
+_EVENT_LINE: _Line = ("", "rx")  # stands for that of the events, which are no device's
+_R = TypeVar("_R", Channel, Chunk)
 
 
 class RecorderError(PolecalError):
@@ -47,8 +49,7 @@ class DiskFull(RecorderError):
     """There is no room for a message; it is kept, and goes before any other once there is."""
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(NamedTuple):  # made in half a dataclass's time: there are hundreds in a second
     """One chunk of bytes as it went over a device's line; ``t_ns`` is CLOCK_MONOTONIC."""
 
     device: str
@@ -266,26 +267,32 @@ class Capture:
     def __iter__(self) -> Iterator[Record | Event]:
         return (item for _, _, item in self.messages())
 
-    def messages(self) -> Iterator[tuple[Channel, Message, Record | Event]]:
-        """Give each message that was recorded, as it lies in the file, with what it means."""
+    def messages(self) -> Iterator[tuple[Channel, bytes, Record | Event]]:
+        """Give each message that was recorded, as it lies in the file (see `message_of`), and its meaning."""
         self.cut, self.damaged, self.used_bytes = None, False, 0
         count, first_ns, last_ns = 0, 0, 0
-        channels: dict[int, Channel] = {}
+        channels: dict[int, tuple[Channel, _Line | None]] = {}
         try:
             with self.path.open("rb") as stream:
-                for opcode, body in self._walk(stream):
-                    for record in _parse(opcode, body):
-                        if isinstance(record, Channel):
-                            channels[record.id] = record
-                            continue
-                        channel = channels.get(record.channel_id)
-                        if channel is None:
-                            raise _Cut("is damaged (a message on a channel that is not there)")
-                        item = _item(record, channel)
-                        if item is not None:
-                            count += 1
-                            first_ns, last_ns = first_ns or item.t_ns, item.t_ns
-                            yield channel, record, item
+                for opcode, body in _inside_chunks(self._walk(stream)):
+                    if opcode == Opcode.CHANNEL:
+                        channel = _read(Channel, body)
+                        channels[channel.id] = channel, _line(channel)
+                    if opcode != Opcode.MESSAGE:
+                        continue
+                    try:
+                        number, _, t_ns, _ = _MESSAGE_HEAD.unpack_from(body)
+                        channel, line = channels[number]
+                    except struct.error as error:
+                        raise _Cut(f"is damaged ({error})") from error
+                    except KeyError as error:
+                        raise _Cut("is damaged (a message on a channel that is not there)") from error
+                    if line is not None:
+                        data = body[_MESSAGE_HEAD.size :]
+                        item = _event(t_ns, data) if line == _EVENT_LINE else Record(*line, t_ns, data)
+                        count += 1
+                        first_ns, last_ns = first_ns or t_ns, t_ns
+                        yield channel, body, item
         except _Cut as cut:
             self.damaged = cut.args[0] != _CUT_OFF
             self.cut = (
@@ -346,39 +353,61 @@ class _Cut(Exception):
     """The file goes no further, though it was not closed there; the message says what is wrong."""
 
 
-def _parse(opcode: int, body: bytes) -> list[Channel | Message]:
-    """Take the channels and messages out of one record. Raises _Cut."""
+def message_of(body: bytes) -> Message:
+    """Read a message's record."""
+    channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+    return Message(channel, log_time, body[_MESSAGE_HEAD.size :], publish_time, sequence)
+
+
+def _inside_chunks(records: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
+    """Give each (opcode, body), in place of a chunk those in it. Raises _Cut.
+
+    Not the package's way, which takes five times as long to read the messages in them.
+    """
+    for record in records:
+        if record[0] != Opcode.CHUNK:
+            yield record
+            continue
+        chunk = _read(Chunk, record[1])
+        try:
+            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        except _DAMAGE as error:
+            raise _Cut(f"is damaged ({error})") from error
+        inside, at = stream.read(size), 0
+        while at < size:
+            if at + _RECORD_HEAD.size > size:
+                raise _Cut("is damaged (a chunk that ends within a record)")
+            opcode, length = _RECORD_HEAD.unpack_from(inside, at)
+            at += _RECORD_HEAD.size + length
+            if at > size:
+                raise _Cut("is damaged (a chunk that ends within a record)")
+            yield opcode, inside[at - length : at]
+
+
+def _read(kind: type[_R], body: bytes) -> _R:
+    """Read a record by the package. Raises _Cut."""
     try:
-        match opcode:
-            case Opcode.MESSAGE:  # nearly all there is: `Message.read` takes twice as long
-                channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
-                return [Message(channel, log_time, body[_MESSAGE_HEAD.size :], publish_time, sequence)]
-            case Opcode.CHANNEL:
-                return [Channel.read(ReadDataStream(BytesIO(body)))]
-            case Opcode.CHUNK:
-                inside = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
-                return [record for record in inside if isinstance(record, Channel | Message)]
+        record: _R = kind.read(ReadDataStream(BytesIO(body)))
     except _DAMAGE as error:
         raise _Cut(f"is damaged ({error})") from error
-    return []
+    return record
 
 
-def _item(message: Message, channel: Channel) -> Record | Event | None:
-    """Say what a message is, None for those that were not recorded but decoded. Raises _Cut."""
+def _event(t_ns: int, data: bytes) -> Event:
+    """Read what was done or noticed. Raises _Cut."""
+    try:
+        content = json.loads(data)
+    except ValueError as error:
+        raise _Cut(f"is damaged ({error})") from error
+    if not isinstance(content, dict):
+        raise _Cut("is damaged (an event that is none)")
+    return Event(t_ns, content)
+
+
+def _line(channel: Channel) -> _Line | None:
+    """Tell the device and the direction that a channel is of; None if it was not recorded but decoded."""
     if channel.topic == EVENTS:
-        try:
-            content = json.loads(message.data)
-        except ValueError as error:
-            raise _Cut(f"is damaged ({error})") from error
-        if not isinstance(content, dict):
-            raise _Cut("is damaged (an event that is none)")
-        return Event(message.log_time, content)
-    line = _line(channel.topic) if channel.message_encoding == RAW else None
-    return None if line is None else Record(*line, message.log_time, message.data)
-
-
-@cache
-def _line(topic: str) -> tuple[str, Direction] | None:
-    """Tell the device and the direction that a topic is of."""
-    device, _, direction = topic.removeprefix("/").rpartition("/")
-    return (device, cast(Direction, direction)) if direction in ("rx", "tx") else None
+        return _EVENT_LINE
+    device, _, direction = channel.topic.removeprefix("/").rpartition("/")
+    recorded = channel.message_encoding == RAW and direction in ("rx", "tx")
+    return (device, cast(Direction, direction)) if recorded else None
