@@ -235,16 +235,19 @@ class Pipeline:
         """
         if not self.routine.running:
             return
-        before = self.routine.state
         if device == SPAN:
             framed = self._navigation.feed(t_ns, data)
         elif device in self._lasers:
             framed = self._lasers[device].channel.feed(t_ns, data)
+            self._navigation.tick(t_ns)
         else:
             return
-        self.tick(t_ns)
+        before = self.routine.state
+        if before is State.COLLECTING and not framed and not self._navigation.lost:
+            return  # as with most chunks: nothing is there that was not before
+        self._advance(t_ns)
         news = self.routine.state is not before
-        for laser in self._lasers.values() if framed else ():  # else nothing is there that was not before
+        for laser in self._lasers.values() if framed else ():
             for stored in laser.channel.fuse():
                 self._take(laser, stored)
                 news = True
