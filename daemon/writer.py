@@ -24,6 +24,7 @@ from polecal.daemon.space import MAKE_ROOM, Space
 
 _UNDER_WAY = 50_000  # minutes of both devices, written or not: beyond it the readers wait
 _SYNC_S = 0.5  # what is written may wait for so long again, in a silence: a power cut takes 1 s at most
+_TOGETHER_S = 0.01  # between two looks at what came: waking for each chunk costs more than writing it
 _COUNT_S = 10.0  # between two sums of what all sessions take: some 0.5 MB are recorded meanwhile
 _BUG = "report it with the session's folder"
 
@@ -126,6 +127,8 @@ class Writer:
             except Exception as error:  # a bug: what comes in is still recorded
                 self._log.exception("bug")
                 self._hand_on(PolecalError(f"a bug in polecal: {error!r}", _BUG))
+            if self._incoming.empty():
+                time.sleep(_TOGETHER_S)
         self.beat_s = math.inf  # done, which is not stuck
 
     def _take(self, item: object, bounded: bool) -> None:
