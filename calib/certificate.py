@@ -33,7 +33,7 @@ _ANGLES = frozenset({"roll", "pitch", "yaw"})
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """By how much of itself √c could at most be lower at another mount, the weights and extras given.
+    """By how much of itself √c could at most be lower at another mount; weights, roughness and extras given.
 
     1 where no bound is known. ``proven`` says that it is no more than 0.5 %, or 0.1 mm: of minima that are as
     near to one another as that, each is.
@@ -50,12 +50,13 @@ def certify(form: Form, vector: Array, held: Collection[str] = ()) -> Certificat
     """Bound what ``form`` costs at any mount with the same ``held`` unknowns and extras as ``vector`` (12,).
 
     What rough ground adds is -σ² ln s of the sensor's height squared s. That is nowhere below its tangent
-    at ``vector``, a form too, which is bounded in its place. No bound is given where the roughness itself is
-    sought (`Form.bumps`), where the data do not tell a position that is not held, and where of the angles
-    others are held than none, roll and pitch, or all.
+    at ``vector``, a form too, which is bounded in its place. How rough it is is given, too: as it looks at
+    ``vector``. No bound is given where the data do not tell a position that is not held, and where of the
+    angles others are held than none, roll and pitch, or all.
     """
+    form = form.of_known_roughness(vector)
     turned = _turned(vector, held)
-    reduced = None if turned is None or form.bumps is not None else _without_position(form, vector, held)
+    reduced = None if turned is None else _without_position(form, vector, held)
     if turned is None or reduced is None:
         return _UNKNOWN
     q, rounding = reduced

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from polecal.calib import consistency, moments, solve
 from polecal.calib.acceptance import Criteria, Verdict, judge
+from polecal.calib.balance import balance
 from polecal.calib.blas import one_thread
 from polecal.calib.certificate import Certificate, certify
 from polecal.calib.coverage import Need, Slice, coverage, slice_of
@@ -67,11 +68,10 @@ class Setup:
     pole_radius_m: float = 0.0
     pass_error: bool = True
     """Whether each pass may have a navigation error of its own, which weighs it down; else Eq. 7 as it is."""
-    by_kind: bool = False
-    """With ``pass_error``: whether pole and ground count by how their returns scatter (`solve.Weights`).
+    by_kind: bool = True
+    """With ``pass_error``: whether the ground counts against the pole what makes the passes agree best.
 
-    Nearer to the least error possible, but it trusts each of the ground's many returns: that needs ground
-    whose bumps are smaller than the way between them.
+    Else mean against mean, as in Eq. 7.
     """
     rough_ground: bool = True
     """Whether the bias that rough ground has in Eq. 6 is taken off (`solve.Form.rough_m2`)."""
@@ -127,6 +127,8 @@ class Result:
     verdict: Verdict
     left_out: dict[int, Array]
     """(6,) m and rad, the mount without a used pass, by its id; empty where there are too few."""
+    weights: Weights
+    """What the used passes and kinds counted."""
     certificate: Certificate | None = None
     """Whether the cost is proven to be the lowest; None where only the next minimum was sought."""
 
@@ -324,6 +326,11 @@ class _Problem:
         # nearly free (paper.md, later work 4) and more passes hardly help: it meets its bound, or is held.
         believable = self._measured_sigma.copy()
         believable[2] = min(believable[2], setup.criteria.max_sigma[2])
+        if weights.ground_return is not None:
+            known = max(paper.spread(about), _LEAST_M**2) / self.pole.count[used].sum() / believable**2
+            less = balance(without, about, ~_mask(held), known, whole.balance) / whole.balance
+            weights = replace(weights, ground_return=less * weights.ground_return)
+            whole, *without = (replace(form, balance=less * form.balance) for form in (whole, *without))
         search = solve.minimise_globally if everywhere else solve.minimise
         vector = measured
         while True:
@@ -446,6 +453,7 @@ class _Problem:
             left_out={}
             if found.left_out is None
             else {one.id: row[:6] for one, row in zip(passes, found.left_out, strict=True)},
+            weights=found.weights,
         )
 
     def certify(self, used: NDArray[np.bool_], found: _Found) -> Certificate:

@@ -17,8 +17,7 @@ from polecal.calib.estimate import Pass, Result, Setup, scatter_of, sum_of
 from polecal.calib.geometry import Array
 from polecal.calib.moments import Moments
 from polecal.calib.observations import Kind, Mount, Returns
-from polecal.calib.solve import EXTRAS, PAPER, Form, Scatter, Weights
-from polecal.calib.uncertainty import FEWEST_PASSES
+from polecal.calib.solve import EXTRAS, Form, Scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,18 +70,7 @@ class Running:
         self._open = {kind: moments.zero() for kind in Kind}
         sites = [one.site for one in used]
         pole, ground = (self._scatter([one.total(kind) for one in used], kind, sites) for kind in Kind)
-        self._weights = PAPER
-        if len(used) >= FEWEST_PASSES:
-            every = np.ones(len(used), dtype=bool)
-            self._weights = Weights.told(
-                pole,
-                ground,
-                every,
-                self._vector,
-                pass_error=setup.pass_error,
-                rough=setup.rough_ground,
-                by_kind=setup.pass_error and setup.by_kind,
-            )
+        self._weights = result.weights
         self._closed = {
             Kind.POLE: _Closed.of(pole, self._weights.pole_ratio, sites[-1]),
             Kind.GROUND: _Closed.of(ground, self._weights.ground_ratio, sites[-1]),

@@ -9,7 +9,7 @@ ground adds to Eq. 6, the more the beams graze it, can be taken off.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,8 +231,9 @@ class Weights:
         """Estimate them from the used passes at a vector (12,) about the minimum.
 
         By ``pass_error`` passes count by how their means scatter, ``by_kind`` kinds by how their returns
-        scatter within the passes: there are many more returns of the ground, and each is as good as one of
-        a pole, or better, whose own width scatters it. ``rough`` ground is what scatters within the passes.
+        scatter within the passes: there are many more returns of the ground, and were they independent, each
+        would be as good as one of a pole, or better, whose own width scatters it. `balance.balance` says
+        what of that is so. ``rough`` ground is what scatters within the passes.
         """
         north_east, down = pole_rows(about), ground_rows(about)
         ground_m2 = ground.mean_within(down, used)
@@ -333,6 +334,17 @@ class Form:
             else ground[1] - self.rough_m2 * np.outer(steeper, steeper)
         )
         return pole[1] + self.balance * told
+
+    def of_known_roughness(self, vector: Array) -> Form:
+        """Give the form whose ground is as rough as it looks at ``vector`` (12,).
+
+        Without ``bumps``; but for a constant nowhere lower than this one, and at ``vector`` as steep.
+        """
+        if self.bumps is None:
+            return self
+        down = ground_rows(vector)[0]
+        less = self.rough_m2 / max(float(down @ self.bumps @ down), _LEAST_ROUGH * self.rough_m2) - 1.0
+        return replace(self, ground=self.ground + less * self.bumps, bumps=None)
 
     def in_h(self, vector: Array) -> Array:
         """Give the form (10, 10) of h that `spread` is at the extras of ``vector`` (12,)."""

@@ -88,10 +88,22 @@ def test_the_wrong_way_round_is_not_the_lowest_where_roll_and_pitch_are_held(pas
     assert cost_m(form, turned) == pytest.approx(cost_m(form, best)), "there is but one"
 
 
-def test_nothing_is_proven_where_the_roughness_itself_is_sought_or_the_sensor_is_in_the_ground(passes):
-    by_kind = form_of(passes, by_kind=True)
-    assert by_kind.bumps is not None
-    assert not certify(by_kind, minimise(by_kind, START)).proven
+def test_roughness_that_is_sought_is_given_in_the_proof(passes):
+    sought = form_of(passes, by_kind=True)
+    found = minimise_globally(sought, START)
+    given = sought.of_known_roughness(found)
+    assert sought.bumps is not None
+    assert given.bumps is None
+    assert certify(sought, found) == certify(given, found)
+    assert certify(sought, found).proven
+    assert minimise(given, found) == pytest.approx(found, abs=1e-6)
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        other = turned_at_random(found, rng)
+        assert given.cost(other) - given.cost(found) >= sought.cost(other) - sought.cost(found)
+
+
+def test_nothing_is_proven_where_the_sensor_is_in_the_ground(passes):
     form = form_of(passes)
     buried = replace(form, ray=np.zeros_like(form.ray))
     assert not certify(buried, START).proven

@@ -87,11 +87,12 @@ def test_residuals_are_about_nothing_and_of_the_size_of_the_cost(evidence, resul
     assert np.abs(evidence.pole_before.offset_m).mean() > 4 * np.abs(pole).mean()
 
 
-def test_a_pass_with_a_worse_position_weighs_most(rig, setup):
+def test_a_pass_with_a_worse_heading_weighs_most(rig, setup):
+    """A worse position would weigh little: passes count by how their poles scatter."""
     returns = rig.drive(passes=14, noise_m=0.01, nav_m=0.001, radius_m=RADIUS_M)
-    position = returns.position_m.copy()
-    position[returns.pass_id == 5] += [0.03, -0.03, 0.0]
-    worse = replace(returns, position_m=position)
+    rpy = returns.rpy_rad.copy()
+    rpy[returns.pass_id == 5, 2] += np.radians(0.6)
+    worse = replace(returns, rpy_rad=rpy)
     result = estimate(passes_of(worse, 30), setup)
     assert not result.set_aside
     told = gather(seen_of(worse), setup, result.mount, result.held, result.extras)
