@@ -58,7 +58,7 @@ class View:
             for one, span in zip(passes, spans_ns, strict=True)
             if one.id not in result.set_aside and one.pole_returns
         ]
-        scatter = scatter_of([one.total(Kind.POLE) for one, _ in used], Kind.POLE, setup.pole_radius_m)
+        scatter = scatter_of([one.totals[Kind.POLE] for one, _ in used], Kind.POLE, setup.pole_radius_m)
         vector = result.vector
         place_m = scatter.means(pole_rows(vector))
         steps = _STEP * np.eye(len(vector))[:6]

@@ -7,35 +7,16 @@ see; and what leaving it out changes is its say, which should not depend on when
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polecal.calib.acceptance import Jump
 from polecal.calib.geometry import Array, wrap
 from polecal.calib.observations import PARAMETERS
-from polecal.calib.solve import Scatter, Weights, ground_rows, pole_rows
 from polecal.calib.student import exceeded
 
 _FEWEST = 8
 _FEWEST_BEFORE = 3  # what came just before the end is what is true now: there a single pass counts
 _FALSE_ALARMS = 1e-3
 """In so many of drives in which nothing jumps one is said to."""
-
-
-def left_out_m(
-    pole: Scatter, ground: Scatter, used: NDArray[np.bool_], left_out: Array, weights: Weights
-) -> float:
-    """Give √c in m of all used passes, each at the solution (P, 12) without it, about the others' means."""
-    total = 0.0
-    for scatter, rows_at, ratio in (
-        (pole, pole_rows, weights.pole_ratio),
-        (ground, ground_rows, weights.ground_ratio),
-    ):
-        squares = sum(
-            scatter.left_out(number, rows_at(vector), used, ratio)
-            for number, vector in zip(np.flatnonzero(used).tolist(), left_out, strict=True)
-        )
-        total += squares / max(1.0, float(scatter.count[used].sum()))
-    return float(np.sqrt(total))
 
 
 def jump(left_out: Array) -> Jump | None:

@@ -31,10 +31,13 @@ class Slice:
     done: bool
 
 
+_HAIR = 1e-12  # of a slice: north is 0 also where rounding made it -1e-14
+
+
 def slice_of(yaw_rad: Array, slice_deg: int) -> NDArray[np.int64]:
     """Give the slice of each platform yaw."""
-    slices: NDArray[np.int64] = (np.degrees(yaw_rad) % 360.0 // slice_deg).astype(np.int64)
-    return slices % (360 // slice_deg)  # -1e-15 % 360 is 360
+    slices: NDArray[np.int64] = np.floor(np.degrees(yaw_rad) / slice_deg + _HAIR).astype(np.int64)
+    return slices % (360 // slice_deg)
 
 
 def coverage(pole_returns: Sequence[dict[int, int]], need: Need) -> tuple[Slice, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import add
@@ -17,9 +17,10 @@ from polecal.calib.blas import one_thread
 from polecal.calib.certificate import Certificate, certify
 from polecal.calib.coverage import Need, Slice, coverage, slice_of
 from polecal.calib.geometry import Array
-from polecal.calib.moments import Moments
+from polecal.calib.moments import DOWN, EAST, NORTH, Moments
 from polecal.calib.observations import PARAMETERS, CalibrationError, Kind, Mount, Returns, axis_shift_m
 from polecal.calib.solve import EXTRAS, PAPER, UNKNOWNS, Form, Scatter, Weights, ground_rows, pole_rows
+from polecal.calib.subsets import Subsets
 from polecal.calib.uncertainty import FEWEST_PASSES, from_model, jackknife
 
 MEASURED_SIGMA = Mount(0.1, 0.1, 0.1, 5.0, 5.0, 5.0)
@@ -40,23 +41,35 @@ _TELLING = (10e-3, 5e-3, 5e-3, 5e-3, 2e-3, 2e-3)
 metre; 2 cm on ten."""
 
 
+Blocks = Mapping[tuple[int, Kind], Moments]
+"""A pass's moments by slice of platform yaw and kind."""
+
+
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """One approach in which the pole is seen, as moments by slice of platform yaw and kind."""
+    """One approach in which the pole is seen, as moments by kind."""
 
     id: int
-    blocks: dict[tuple[int, Kind], Moments]
+    totals: dict[Kind, Moments]
+    counts: dict[tuple[int, Kind], int]
+    """How many returns, by slice of platform yaw and kind."""
     site: int = 0
     """Passes of another day have another: pole and ground are compared within a site only."""
 
-    def total(self, kind: Kind) -> Moments:
-        """Give the moments of one kind, over all slices."""
-        return sum_of(block for (_, of_kind), block in self.blocks.items() if of_kind is kind)
+    @classmethod
+    def of(cls, number: int, blocks: Blocks, site: int = 0) -> Pass:
+        """Add up the moments of one pass."""
+        return cls(
+            number,
+            {kind: sum_of(block for (_, of), block in blocks.items() if of is kind) for kind in Kind},
+            {key: block.count for key, block in blocks.items()},
+            site,
+        )
 
     @property
     def pole_returns(self) -> dict[int, int]:
         """How many pole returns, by slice."""
-        return {part: block.count for (part, kind), block in self.blocks.items() if kind is Kind.POLE}
+        return {part: count for (part, kind), count in self.counts.items() if kind is Kind.POLE}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,22 +158,50 @@ def sum_of(blocks: Iterable[Moments]) -> Moments:
 
 def split(returns: Returns, slice_deg: int) -> dict[tuple[int, Kind], Moments]:
     """Sum up one pass's returns by slice of platform yaw and kind."""
-    one = replace(returns, pass_id=np.zeros(len(returns), dtype=np.int64))
-    return passes_of(one, slice_deg)[0].blocks if len(one) else {}
-
-
-def passes_of(returns: Returns, slice_deg: int, *, timed: bool = True) -> list[Pass]:
-    """Sum up returns by pass, slice of platform yaw and kind; ready for a time offset if ``timed``."""
-    numbers, index = np.unique(returns.pass_id, return_inverse=True)
-    slices = 360 // slice_deg
-    group = index * slices + slice_of(returns.rpy_rad[:, 2], slice_deg)
-    passes = [Pass(int(number), {}) for number in numbers]
+    part = slice_of(returns.rpy_rad[:, 2], slice_deg)
+    blocks: dict[tuple[int, Kind], Moments] = {}
     for kind in Kind:
         of_kind = np.flatnonzero(returns.kind == kind)
-        blocks = moments.by_group(returns, of_kind, group[of_kind], ranged=kind is Kind.POLE, timed=timed)
+        sums = moments.by_group(returns, of_kind, part[of_kind], ranged=kind is Kind.POLE)
+        blocks |= {(number, kind): block for number, block in sums.items()}
+    return blocks
+
+
+def passes_of(
+    returns: Returns, slice_deg: int, *, timed: bool = True, thick: bool = True, tilted: bool = True
+) -> list[Pass]:
+    """Sum up returns by pass and kind.
+
+    What comes of it is ready for a time offset if ``timed``; for a range offset and a pole that is ``thick``;
+    for a pole that leans and ground that slopes where they are ``tilted``.
+    """
+    numbers, index = _numbered(returns.pass_id)
+    slices = 360 // slice_deg
+    group = index * slices + slice_of(returns.rpy_rad[:, 2], slice_deg)
+    passes = [Pass(int(number), {kind: moments.zero() for kind in Kind}, {}) for number in numbers]
+    every, level = (NORTH, EAST, DOWN), {Kind.POLE: (NORTH, EAST), Kind.GROUND: (DOWN,)}
+    for kind in Kind:
+        of_kind = np.flatnonzero(returns.kind == kind)
+        ranged = thick and kind is Kind.POLE
+        axes = every if tilted or ranged else level[kind]
+        blocks = moments.by_group(returns, of_kind, index[of_kind], axes=axes, ranged=ranged, timed=timed)
         for label, block in blocks.items():
-            passes[label // slices].blocks[label % slices, kind] = block
+            passes[label].totals[kind] = block
+        counts = np.bincount(group[of_kind])
+        for label in np.flatnonzero(counts).tolist():
+            passes[label // slices].counts[label % slices, kind] = int(counts[label])
     return passes
+
+
+def _numbered(pass_id: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Give the passes' ids in order, and which of them each return (N,) is of."""
+    lowest = pass_id.min(initial=0)
+    if pass_id.max(initial=0) - lowest > len(pass_id):  # np.unique sorts: half as long as all sums take
+        numbers, index = np.unique(pass_id, return_inverse=True)
+        return numbers, index
+    there = np.bincount(pass_id - lowest) > 0
+    numbers = np.flatnonzero(there) + lowest
+    return numbers, (np.cumsum(there) - 1)[pass_id - lowest]
 
 
 def calibrate(
@@ -206,7 +247,13 @@ def calibrate(
     """
     need = need or Need()
     _refuse_absurd(returns)
-    passes = passes_of(returns, need.slice_deg, timed="time_s" in extras)
+    passes = passes_of(
+        returns,
+        need.slice_deg,
+        timed="time_s" in extras,
+        thick=pole_radius_m > 0 or "range_m" in extras,
+        tilted=not {"time_s", "range_m"}.issuperset(extras),
+    )
     setup = Setup(
         measured=mount,
         measured_sigma=measured_sigma,
@@ -230,16 +277,18 @@ def _refuse_absurd(returns: Returns) -> None:
             f"range_m goes from {returns.range_m.min():g} to {returns.range_m.max():g}",
             f"it must be above 0 and up to {_FARTHEST_M:g}, in metres; leave out beams without a range",
         )
-    if np.abs(returns.position_m).max() > _FARTHEST_ORIGIN_M:
+    if _farthest(returns.position_m) > _FARTHEST_ORIGIN_M:
         raise CalibrationError(
-            f"position_m goes up to {np.abs(returns.position_m).max():g}: no digits left for millimetres",
+            f"position_m goes up to {_farthest(returns.position_m):g}: no digits left for millimetres",
             "take north, east and down in metres from a point near the pole",
         )
-    if (
-        np.abs(returns.rpy_rad).max() > _MOST_TURNED_RAD
-        or np.abs(returns.bearing_rad).max() > _MOST_TURNED_RAD
-    ):
+    if max(_farthest(returns.rpy_rad), _farthest(returns.bearing_rad)) > _MOST_TURNED_RAD:
         raise CalibrationError("rpy_rad or bearing_rad goes beyond two turns", "give radians, not degrees")
+
+
+def _farthest(values: Array) -> float:
+    """Give how far from 0 any is, on either side."""
+    return max(float(values.max()), -float(values.min()))
 
 
 @one_thread
@@ -265,7 +314,9 @@ def estimate(passes: Sequence[Pass], setup: Setup, *, everywhere: bool = False) 
         set_aside[passes[odd[0]].id] = odd[1]
         used[odd[0]] = False
     result = problem.result(used, found, set_aside)
-    return replace(result, certificate=problem.certify(used, found)) if everywhere else result
+    return (
+        replace(result, certificate=certify(found.form, found.vector, found.held)) if everywhere else result
+    )
 
 
 def scatter_of(
@@ -285,9 +336,11 @@ class _Found:
     vector: Array
     covariance: Array
     held: frozenset[str]
-    weights: Weights
+    form: Form
+    subsets: Subsets | None
+    """The passes near the minimum; None where there are too few."""
     left_out: Array | None
-    """(P, 12) without each used pass, or None where there are too few."""
+    """(U, 12) without each used pass, or None where there are too few."""
 
 
 class _Problem:
@@ -296,7 +349,8 @@ class _Problem:
     def __init__(self, passes: Sequence[Pass], setup: Setup) -> None:
         sites = [one.site for one in passes]
         self.pole, self.ground = (
-            scatter_of([one.total(kind) for one in passes], kind, setup.pole_radius_m, sites) for kind in Kind
+            scatter_of([one.totals[kind] for one in passes], kind, setup.pole_radius_m, sites)
+            for kind in Kind
         )
         self._passes, self._setup = passes, setup
         self._measured = np.concatenate([setup.measured.vector, np.zeros(len(EXTRAS))])
@@ -321,25 +375,26 @@ class _Problem:
                 by_kind=setup.pass_error and setup.by_kind,
             )
         whole = self._form(used, weights)
-        without = [self._form(_but(used, one), weights) for one in numbers.tolist()] if enough else []
         # What the data know no better than the tape measure is not taken from them. On a flat pad z is
         # nearly free (paper.md, later work 4) and more passes hardly help: it meets its bound, or is held.
         believable = self._measured_sigma.copy()
         believable[2] = min(believable[2], setup.criteria.max_sigma[2])
         if weights.ground_return is not None:
             known = max(paper.spread(about), _LEAST_M**2) / self.pole.count[used].sum() / believable**2
-            less = balance(without, about, ~_mask(held), known, whole.balance) / whole.balance
+            near = Subsets.near(self.pole, self.ground, weights, about, ~_mask(held), bend=whole.bend(about))
+            less = balance(near, _each_but_one(used), known, whole.balance) / whole.balance
             weights = replace(weights, ground_return=less * weights.ground_return)
-            whole, *without = (replace(form, balance=less * form.balance) for form in (whole, *without))
+            whole = replace(whole, balance=less * whole.balance)
         search = solve.minimise_globally if everywhere else solve.minimise
         vector = measured
         while True:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
             squared = max((paper if weights.ground_return else whole).spread(vector), _LEAST_M**2)
-            left_out = None
+            subsets = left_out = None
             if enough:
-                left_out = np.stack([solve.minimise(part, vector, held) for part in without])
+                subsets = Subsets.near(self.pole, self.ground, weights, vector, free, bend=whole.bend(vector))
+                left_out = subsets.minima(_each_but_one(used))
                 covariance = jackknife(left_out)
             else:
                 covariance = from_model(whole.information(vector), squared, len(numbers), free)
@@ -357,7 +412,7 @@ class _Problem:
                 doubt = np.maximum(doubt, far * free)
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
-                return _Found(vector, covariance, frozenset(held), weights, left_out)
+                return _Found(vector, covariance, frozenset(held), whole, subsets, left_out)
             held.add(UNKNOWNS[worst])
 
     def oddest(self, used: NDArray[np.bool_], vector: Array) -> tuple[int, str] | None:
@@ -390,29 +445,25 @@ class _Problem:
         paper = self._form(used)  # Eq. 7
         passes = [one for one, is_used in zip(self._passes, used, strict=True) if is_used]
         mask = _mask(held)[:6]
-        covariance = found.covariance[:6, :6] + self._not_told(used, found)
+        covariance = found.covariance[:6, :6] + self._not_told(found)
         covariance[mask, mask] = self._measured_sigma[:6][mask] ** 2
         sigma = np.sqrt(np.diag(covariance))
         spread = np.sqrt(np.diag(found.covariance))
         told = [index for index, name in enumerate(UNKNOWNS) if name in EXTRAS and name not in held]
         cost_m = solve.cost_m(paper, vector)
-        order = np.flatnonzero(used)
-        improvement = doubling = None
-        if len(passes) > max(_LAST_PASSES, FEWEST_PASSES) and cost_m:
+        order = np.flatnonzero(used).tolist()
+        improvement = doubling = left_out_m = None
+        if found.subsets is not None and found.left_out is not None:
+            left_out_m = found.subsets.left_out_m(used, found.left_out)
+        if found.subsets is not None and len(passes) > _LAST_PASSES:
             # Halves that have seen as much: from every heading every other pass.
-            turned = sorted(
-                order.tolist(), key=lambda number: min(self._passes[number].pole_returns, default=0)
-            )
-            some = (order[:-_LAST_PASSES].tolist(), turned[::2], turned[1::2])
-            last, *halves = (
-                solve.cost_m(paper, self._minimum_of(numbers, found)) / cost_m - 1.0 for numbers in some
-            )
+            turned = sorted(order, key=lambda number: min(self._passes[number].pole_returns, default=0))
+            some = np.zeros((3, len(used)), dtype=bool)
+            for row, numbers in zip(some, (order[:-_LAST_PASSES], turned[::2], turned[1::2]), strict=True):
+                row[numbers] = True
+            costs_m = [solve.cost_m(paper, minimum) for minimum in found.subsets.minima(some)]
+            last, *halves = (part_m / cost_m - 1.0 if cost_m else 0.0 for part_m in costs_m)
             improvement, doubling = last, float(np.mean(halves))
-        elif len(passes) > max(_LAST_PASSES, FEWEST_PASSES):
-            improvement = doubling = 0.0
-        left_out_m = None
-        if found.left_out is not None:
-            left_out_m = consistency.left_out_m(self.pole, self.ground, used, found.left_out, found.weights)
         slices = coverage([one.pole_returns for one in passes], setup.need)
         verdict = judge(
             criteria=setup.criteria,
@@ -453,20 +504,10 @@ class _Problem:
             left_out={}
             if found.left_out is None
             else {one.id: row[:6] for one, row in zip(passes, found.left_out, strict=True)},
-            weights=found.weights,
+            weights=found.subsets.weights if found.subsets else PAPER,
         )
 
-    def certify(self, used: NDArray[np.bool_], found: _Found) -> Certificate:
-        """Say whether what was found is proven to be the lowest minimum, its weights and extras given."""
-        return certify(self._form(used, found.weights), found.vector, found.held)
-
-    def _minimum_of(self, numbers: Sequence[int], found: _Found) -> Array:
-        """Find the minimum of some passes, what is held and how they weigh as in ``found``."""
-        some = np.zeros(len(self._passes), dtype=bool)
-        some[list(numbers)] = True
-        return solve.minimise(self._form(some, found.weights), found.vector, found.held)
-
-    def _not_told(self, used: NDArray[np.bool_], found: _Found) -> Array:
+    def _not_told(self, found: _Found) -> Array:
         """Give what the extras that should be solved for and cannot add to the covariance (6, 6).
 
         They are held at 0, and may be as far from it as they need not to be told: what is found would move
@@ -474,7 +515,7 @@ class _Problem:
         """
         free = ~_mask(found.held)
         untold = np.flatnonzero(_mask(self._setup.extras & found.held))
-        hessian = self._form(used, found.weights).information(found.vector)
+        hessian = found.form.information(found.vector)
         moved = np.zeros((len(UNKNOWNS), len(untold)))
         moved[free] = np.linalg.pinv(hessian[np.ix_(free, free)], rcond=1e-12, hermitian=True) @ (
             -hessian[np.ix_(free, untold)] * self._measured_sigma[untold]
@@ -483,20 +524,12 @@ class _Problem:
         return added
 
     def _form(self, used: NDArray[np.bool_], weights: Weights = PAPER) -> Form:
-        return Form(
-            self.pole.form(used, weights.pole_ratio),
-            self.ground.form(used, weights.ground_ratio),
-            weights.rough_m2,
-            self.ground.ray(used) if weights.rough_m2 else None,
-            self.ground.within_form(used) if weights.rough_m2 and weights.ground_return else None,
-            weights.balance(self.pole.count[used].sum(), self.ground.count[used].sum()),
-        )
+        return Form.of(self.pole, self.ground, used, weights)
 
 
-def _but(used: NDArray[np.bool_], *numbers: int) -> NDArray[np.bool_]:
-    rest = used.copy()
-    rest[list(numbers)] = False
-    return rest
+def _each_but_one(used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Give the used passes without each of them in turn, (U, P)."""
+    return used & ~np.eye(len(used), dtype=bool)[used]
 
 
 def _mask(held: Collection[str]) -> NDArray[np.bool_]:

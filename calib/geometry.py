@@ -6,7 +6,7 @@ Euler order yaw, pitch, roll: ``C = Rz(yaw) Ry(pitch) Rx(roll)``, from the turne
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,24 +19,30 @@ def rotation(rpy_rad: Array) -> Array:
     """Give C = Rz(yaw) Ry(pitch) Rx(roll), (..., 3, 3), of (..., 3) roll, pitch, yaw in rad."""
     if rpy_rad.ndim == 1:  # each solution asks a thousand times for one: a quarter of the time
         angles = rpy_rad.tolist()
-        return np.array(_entries(map(math.cos, angles), map(math.sin, angles))).reshape(3, 3)
-    return _matrices(rotation_entries(rpy_rad))
+        turns = [math.cos(angle) for angle in angles], [math.sin(angle) for angle in angles]
+        return np.array([_row(axis, *turns) for axis in range(3)])
+    return np.ascontiguousarray(np.moveaxis(rotation_rows(rpy_rad), (0, 1), (-2, -1)))
 
 
-def rotation_entries(rpy_rad: Array) -> tuple[Array, ...]:
-    """Give the nine entries (...) of `rotation`, row by row, each an array of its own."""
-    return _entries(np.moveaxis(np.cos(rpy_rad), -1, 0), np.moveaxis(np.sin(rpy_rad), -1, 0))
+def rotation_rows(rpy_rad: Array, axes: Sequence[int] = (0, 1, 2)) -> Array:
+    """Give some rows of `rotation`, (axes, 3, ...); the lowest alone takes no yaw, and half the time."""
+    turning = [rpy_rad[..., angle] for angle in range(3 if min(axes) < 2 else 2)]
+    turns = [np.cos(angle) for angle in turning], [np.sin(angle) for angle in turning]
+    rows = np.empty((len(axes), 3, *rpy_rad.shape[:-1]))
+    for row, axis in zip(rows, axes, strict=True):
+        for entry, value in zip(row, _row(axis, *turns), strict=True):
+            entry[...] = value
+    return rows
 
 
-def _entries(cosines: Iterable[Any], sines: Iterable[Any]) -> tuple[Any, ...]:
-    """Give `rotation_entries` of the cosines and sines of roll, pitch and yaw: numbers, or arrays."""
-    cr, cp, cy = cosines
-    sr, sp, sy = sines
-    return (
-        *(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        *(-sp, cp * sr, cp * cr),
-    )
+def _row(axis: int, cosines: Sequence[Any], sines: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """Give a row of `rotation` of the cosines and sines of roll, pitch and yaw: numbers, or arrays."""
+    cr, cp = cosines[:2]
+    sr, sp = sines[:2]
+    if axis == 2:
+        return -sp, cp * sr, cp * cr
+    along, across = (cosines[2], sines[2]) if axis == 0 else (sines[2], -cosines[2])
+    return along * cp, along * sp * sr - across * cr, along * sp * cr + across * sr
 
 
 def rotation_gradient(rpy_rad: Array) -> Array:

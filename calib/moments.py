@@ -17,15 +17,16 @@ add and subtract.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polecal.calib.blas import one_thread
-from polecal.calib.geometry import Array, rotation_entries
+from polecal.calib.geometry import Array, rotation_rows
 from polecal.calib.observations import Returns
 
 BASE = slice(0, 10)
@@ -34,33 +35,96 @@ TIME = slice(16, 26)
 TIME_SQUARED = slice(26, 36)
 """Where in h⁺ are h, and the parts that a range offset, a time offset and its square scale."""
 WIDTH = 36
-_BLOCK = 2048  # returns at once: 1.8 MB of features at most, which stay in the cache
+NORTH, EAST, DOWN = range(3)
+_BLOCK = 2048 * 108  # numbers at once: 1.8 MB of features, which stay in the cache
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Moments:
-    """Sums over returns of one kind: how many, Σ f (108,) and Σ f fᵀ (108, 108), f axis by axis of n (m)."""
+    """Sums over returns of one kind: how many, Σ f (K,) and Σ f fᵀ, f in m, axis by axis of n.
+
+    ``features`` (K,) says which of the 108 were summed up, in order; of the others nothing is known.
+    Σ f fᵀ is symmetric: ``packed`` (K (K + 1) / 2,) is its upper triangle, row by row.
+    """
 
     count: int
+    features: NDArray[np.int64]
     first: Array
-    second: Array
+    packed: Array
 
     def __add__(self, other: Moments) -> Moments:
-        return Moments(self.count + other.count, self.first + other.first, self.second + other.second)
+        return self._with(other, 1)
 
     def __sub__(self, other: Moments) -> Moments:
-        return Moments(self.count - other.count, self.first - other.first, self.second - other.second)
+        return self._with(other, -1)
 
-    def covariance(self) -> Array:
-        """Give the covariance (108, 108) of the features, m²; of no returns, nothing."""
-        mean = self.first / max(1, self.count)
-        covariance = self.second / max(1, self.count) - np.outer(mean, mean)
-        return (covariance + covariance.T) / 2
+    def _with(self, other: Moments, sign: int) -> Moments:
+        one, two = self, other
+        if not np.array_equal(one.features, two.features):
+            both = np.union1d(one.features, two.features)
+            one, two = one._over(both), two._over(both)
+        return Moments(
+            one.count + sign * two.count,
+            one.features,
+            one.first + sign * two.first,
+            one.packed + sign * two.packed,
+        )
+
+    def _over(self, features: NDArray[np.int64]) -> Moments:
+        """Give the same, of more features: the sums of those that were left out are 0."""
+        first = np.zeros(len(features))
+        second = np.zeros((len(features), len(features)))
+        there = np.searchsorted(features, self.features)
+        first[there], second[np.ix_(there, there)] = self.first, self.second
+        return of_sums(self.count, features, first, second)
+
+    @property
+    def second(self) -> Array:
+        """Σ f fᵀ, (K, K)."""
+        return self.packed[_unpacked(len(self.features))]
+
+    def mean(self) -> Array:
+        """Give the mean (3, 36) of the features, m; 0 of those that were left out."""
+        mean = np.zeros(3 * WIDTH)
+        mean[self.features] = self.first / max(1, self.count)
+        return mean.reshape(3, WIDTH)
 
 
 def zero() -> Moments:
     """Give the moments of no returns."""
-    return Moments(0, np.zeros(3 * WIDTH), np.zeros((3 * WIDTH, 3 * WIDTH)))
+    return Moments(0, np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
+
+
+def of_sums(count: int, features: NDArray[np.int64], first: Array, second: Array) -> Moments:
+    """Pack sums over so many returns: of features (K,), (K,) and (K, K)."""
+    return Moments(count, features, first, second.ravel()[_upper(len(features))])
+
+
+def stacked(parts: Sequence[Moments]) -> tuple[NDArray[np.int64], Array, Array]:
+    """Give the features (K,) that any of P parts has, and the parts' sums, (P, K) and (P, K, K)."""
+    features = parts[0].features if parts else zero().features
+    for part in parts:
+        if not np.array_equal(part.features, features):
+            features = np.union1d(features, part.features)
+    alike = [part if np.array_equal(part.features, features) else part._over(features) for part in parts]
+    first = np.stack([part.first for part in alike])
+    return features, first, np.stack([part.packed for part in alike])[:, _unpacked(len(features))]
+
+
+@cache
+def _upper(width: int) -> NDArray[np.int64]:
+    """Give where the upper triangle is in a matrix (K, K), flat."""
+    row, column = np.triu_indices(width)
+    return row * width + column
+
+
+@cache
+def _unpacked(width: int) -> NDArray[np.int64]:
+    """Give where each entry (K, K) of a symmetric matrix is in its packed upper triangle."""
+    row, column = np.indices((width, width))
+    low, high = np.minimum(row, column), np.maximum(row, column)
+    where: NDArray[np.int64] = low * width - low * (low - 1) // 2 + high - low
+    return where
 
 
 def of(returns: Returns) -> Moments:
@@ -75,67 +139,69 @@ def by_group(
     index: NDArray[np.int64],
     group: NDArray[np.int64],
     *,
+    axes: Collection[int] = (NORTH, EAST, DOWN),
     ranged: bool = True,
     timed: bool = True,
 ) -> dict[int, Moments]:
     """Sum up those returns (K,) that ``index`` picks, by the number (K,) of their ``group``.
 
-    What a range offset or a time offset scales is left at 0 where it is not ``ranged`` or ``timed``: that
-    saves half of the work, or more.
+    Of axes of n that are not asked for nothing is summed, nor what a range offset or a time offset scales
+    where it is not ``ranged`` or ``timed``: that saves half of the work, or more.
     """
-    order = np.argsort(group, kind="stable")
-    index, group = index[order], group[order]
+    if (np.diff(group) < 0).any():
+        order = np.argsort(group, kind="stable")
+        index, group = index[order], group[order]
     parts = [BASE, *[RANGE] * ranged, *[TIME, TIME_SQUARED] * (timed and returns.motion is not None)]
     of_axis = np.concatenate([np.arange(WIDTH)[part] for part in parts])
-    summed = (WIDTH * np.arange(3)[:, None] + of_axis).ravel()
+    summed = (WIDTH * np.array(sorted(axes))[:, None] + of_axis).ravel()
     sums: dict[int, tuple[int, Array | float, Array | float]] = {}
-    for start in range(0, len(index), _BLOCK):
-        block = group[start : start + _BLOCK]
-        features = _features(returns, index[start : start + _BLOCK], parts)
+    size = _BLOCK // len(summed)
+    for start in range(0, len(index), size):
+        block = group[start : start + size]
+        features = _features(returns, index[start : start + size], sorted(axes), parts)
         for begin, end in pairwise([0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(block)]):
             some, number = features[:, begin:end], int(block[begin])
             count, first, second = sums.get(number, (0, 0.0, 0.0))
             sums[number] = count + end - begin, first + some.sum(axis=1), second + some @ some.T
-    totals = {}
-    for number, (count, first, second) in sums.items():
-        total = totals[number] = replace(zero(), count=count)
-        total.first[summed], total.second[np.ix_(summed, summed)] = first, second
-    return totals
+    return {
+        number: of_sums(count, summed, np.asarray(first), np.asarray(second))
+        for number, (count, first, second) in sums.items()
+    }
 
 
-def _features(returns: Returns, index: NDArray[np.int64], parts: Sequence[slice]) -> Array:
-    """Give the ``parts`` of [G | cos θ C | sin θ C | Ġ | G̈/2], each feature a row: (3 × features, N)."""
+def _features(
+    returns: Returns, index: NDArray[np.int64], axes: Sequence[int], parts: Sequence[slice]
+) -> Array:
+    """Give the ``parts`` of [G | cos θ C | sin θ C | Ġ | G̈/2], each feature a row: (axes × features, N)."""
     bearing = returns.bearing_rad[index]
     across = np.stack([np.cos(bearing), np.sin(bearing)])
     flat = returns.range_m[index] * across
-    c = np.stack(rotation_entries(returns.rpy_rad[index])).reshape(3, 3, -1)  # axis of n, of b, return
-    position = returns.position_m[index].T
-    rows = []
-    for part in parts:
-        if part is BASE:
-            rows.append(_moved(c, position, flat))
-        elif part is RANGE:
-            rows.append((across[:, None, None] * c).swapaxes(0, 1).reshape(3, 6, -1))
+    c = rotation_rows(returns.rpy_rad[index], axes)  # axis of n, of b, return
+    position = returns.position_m[index].T[axes]
+    features = np.empty((len(axes), sum(part.stop - part.start for part in parts), len(index)))
+    _move(c, position, flat, features[:, BASE])
+    if RANGE in parts:
+        np.multiply(
+            across[:, None, None], c, out=features[:, RANGE].reshape(len(axes), 2, 3, -1).swapaxes(0, 1)
+        )
     if TIME in parts and returns.motion is not None:
         velocity, rate, acceleration, angular_acceleration = (of[index].T for of in returns.motion)
         turn = _crossed(c, rate)  # Ċ
         twist = (_crossed(turn, rate) + _crossed(c, angular_acceleration)) / 2  # C̈/2
-        rows += [_moved(turn, velocity, flat), _moved(twist, acceleration / 2, flat)]
-    features = np.concatenate(rows, axis=1)
+        _move(turn, velocity[axes], flat, features[:, -20:-10])
+        _move(twist, acceleration[axes] / 2, flat, features[:, -10:])
     return features.reshape(-1, len(index))
 
 
-def _moved(matrix: Array, vector: Array, flat: Array) -> Array:
-    """Give [x M | y M | M | v], (3, 10, N), of (3, 3, N), (3, N) and (x, y) in s, (2, N)."""
-    moved = np.empty((3, 10, matrix.shape[-1]))
+def _move(matrix: Array, vector: Array, flat: Array, moved: Array) -> None:
+    """Put [x M | y M | M | v] into (axes, 10, N), of (axes, 3, N), (axes, N) and (x, y) in s, (2, N)."""
     np.multiply(flat[0], matrix, out=moved[:, 0:3])
     np.multiply(flat[1], matrix, out=moved[:, 3:6])
     moved[:, 6:9], moved[:, 9] = matrix, vector
-    return moved
 
 
 def _crossed(matrix: Array, vector: Array) -> Array:
-    """Give M [v]× of (3, 3, N) and (3, N): each row crossed with v."""
+    """Give M [v]× of (axes, 3, N) and (3, N): each row crossed with v."""
     crossed = np.empty_like(matrix)
     for axis in range(3):
         one, two = (axis + 1) % 3, (axis + 2) % 3

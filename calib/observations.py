@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polecal import PolecalError
-from polecal.calib.geometry import Array, rotation, rotation_entries
+from polecal.calib.geometry import Array, rotation, rotation_rows
 
 PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw")
 """The six unknowns, in the order of every vector and covariance (m and rad)."""
@@ -156,8 +156,7 @@ def points_body(range_m: Array, bearing_rad: Array, mount: Mount) -> Array:
 def points_nav(returns: Returns, mount: Mount) -> Array:
     """Give (N, 3) returns in n, m: Eq. 2."""
     x, y, z = points_body(returns.range_m, returns.bearing_rad, mount).T
-    c = rotation_entries(returns.rpy_rad)
-    turned = [c[row] * x + c[row + 1] * y + c[row + 2] * z for row in (0, 3, 6)]
+    turned = [row[0] * x + row[1] * y + row[2] * z for row in rotation_rows(returns.rpy_rad)]
     return np.stack(turned, axis=1) + returns.position_m
 
 

@@ -32,7 +32,7 @@ def residuals(
 
     The common pole is the mean of the ``used`` passes' returns of the same site, as in Eq. 5.
     """
-    scatter = scatter_of([one.total(Kind.POLE) for one in passes], Kind.POLE, setup.pole_radius_m)
+    scatter = scatter_of([one.totals[Kind.POLE] for one in passes], Kind.POLE, setup.pole_radius_m)
     rows = pole_rows(result.vector)
     means, within = scatter.means(rows), 2 * scatter.within(rows)  # of north and east together
     sites = np.array([one.site for one in passes])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from polecal.calib.estimate import Pass, sum_of
 from polecal.calib.geometry import Array
-from polecal.calib.moments import BASE, WIDTH
+from polecal.calib.moments import BASE, DOWN
 from polecal.calib.observations import Kind, Mount
 
 STEP_M = 0.1
@@ -58,19 +58,19 @@ class Sight:
 
 def ground_of(mount: Mount, passes: Sequence[Pass]) -> tuple[float, float]:
     """Give how far the ground is below the body's origin, at least and at most, from the passes if any."""
-    ground = sum_of(one.total(Kind.GROUND) for one in passes)
+    ground = sum_of(one.totals[Kind.GROUND] for one in passes)
     if not ground.count:
         lowest = max(_GROUND_M[0], mount.z_m + _LEAST_HEIGHT_M)
         return lowest, lowest + _GROUND_M[1]
-    down = ground.first.reshape(3, WIDTH)[2, BASE] / ground.count
+    down = ground.mean()[DOWN, BASE]
     below = float(down[:9] @ _lever(mount))
     return below, below
 
 
 def pole_at(mount: Mount, passes: Sequence[Pass]) -> tuple[float, float]:
     """Give where in n the passes of one day saw the pole: north and east, m."""
-    pole = sum_of(one.total(Kind.POLE) for one in passes)
-    place = pole.first.reshape(3, WIDTH)[:2, BASE] / pole.count @ np.append(_lever(mount), 1.0)
+    pole = sum_of(one.totals[Kind.POLE] for one in passes)
+    place = pole.mean()[:DOWN, BASE] @ np.append(_lever(mount), 1.0)
     return float(place[0]), float(place[1])
 
 

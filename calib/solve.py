@@ -9,7 +9,7 @@ ground adds to Eq. 6, the more the beams graze it, can be taken off.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from polecal.calib.geometry import (
     skew,
     turning,
 )
-from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments
+from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments, stacked
 from polecal.calib.observations import PARAMETERS
 
 EXTRAS = ("time_s", "range_m", "lean_north", "lean_east", "slope_north", "slope_east")
@@ -37,6 +37,7 @@ CLEARLY = 0.995
 _STEPS = 100
 _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
 _NOTHING = 1e-15
+_STEP = 1e-5
 _DESCENTS = 40
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
 _LEAST_ROUGH = 1e-6  # of the ground's variance
@@ -67,14 +68,21 @@ class Scatter:
         sites: Sequence[int] | None = None,
     ) -> None:
         self.count = np.array([one.count for one in passes], dtype=np.float64)
-        self._mean = np.stack([one.first / max(1, one.count) for one in passes])  # (P, 108)
-        self._within = np.stack([one.count * one.covariance() for one in passes])
-        three = self._within.reshape(-1, 3, WIDTH, 3, WIDTH)
-        for features in (self._mean.reshape(-1, 3, WIDTH), three, three.swapaxes(2, 4)):  # views
-            features[..., 0:6] += shift_m * features[..., RANGE]
-            features[..., RANGE] *= ranged
-        self._aside = across_m**2 * np.stack([_aside(one) for one in passes]) if across_m else None
-        self._all_within = self._within.sum(axis=0)
+        features, first, second = stacked(passes)
+        per_return = 1.0 / np.maximum(1.0, self.count)
+        mean = first * per_return[:, None]
+        within = second - first[:, :, None] * mean[:, None]
+        self._aside = across_m**2 * _aside(features, second, per_return) if across_m else None
+        along = np.flatnonzero(_of_range(features))
+        if shift_m and len(along):
+            moved = np.searchsorted(features, features[along] - RANGE.start)
+            for sums in (mean, within.swapaxes(1, 2), within):  # views
+                sums[..., moved] += shift_m * sums[..., along]
+        if len(along) and not ranged:
+            kept = np.delete(np.arange(len(features)), along)
+            features, mean, within = features[kept], mean[:, kept], within[:, kept[:, None], kept]
+            self._aside = None if self._aside is None else self._aside[:, kept[:, None], kept]
+        self._features, self._mean, self._within = features, mean, within
         self.sites = np.zeros(len(passes), dtype=np.int64) if sites is None else np.array(sites)
 
     def form(self, used: NDArray[np.bool_], ratio: float = np.inf) -> Array:
@@ -86,64 +94,78 @@ class Scatter:
         seen within a pass counts for more, and there the returns to the side of a thick pole do harm
         (`_aside`), which is taken off.
         """
-        total = self.count[used].sum()
-        if not total:
-            return np.zeros((3 * WIDTH, 3 * WIDTH))
-        weight = self._weight(used, ratio)
+        total = max(1.0, self.count[used].sum())
+        weight = self.weight(ratio)[used]
         apart = self._mean[used]
         for site in _each(self.sites[used]):
             apart[site] -= weight[site] / (weight[site].sum() or 1.0) @ apart[site]
-        few = used.sum() < len(used) / 2
-        within = self._within[used].sum(axis=0) if few else self._all_within - self._within[~used].sum(axis=0)
+        within = self._within[used].sum(axis=0)
         if self._aside is not None and np.isfinite(ratio):
-            within = within - self._aside[used].sum(axis=0)
-        form: Array = (within + (weight[:, None] * apart).T @ apart) / total
-        return form
+            within -= self._aside[used].sum(axis=0)
+        return self._whole((within + (weight[:, None] * apart).T @ apart) / total)
 
     def within_form(self, used: NDArray[np.bool_]) -> Array:
         """Give the part (108, 108) of `form` that is within the used passes, m²."""
-        within: Array = self._within[used].sum(axis=0) / max(1.0, self.count[used].sum())
-        return within
+        return self._whole(self._within[used].sum(axis=0) / max(1.0, self.count[used].sum()))
+
+    def _whole(self, matrix: Array) -> Array:
+        """Give a matrix (K, K) of the features that there are as one of all, (108, 108)."""
+        whole = np.zeros((3 * WIDTH, 3 * WIDTH))
+        whole[self._features[:, None], self._features] = matrix
+        return whole
 
     def ray(self, used: NDArray[np.bool_]) -> Array:
         """Give the mean (108,) of the used passes' features, all but those of the beams' way left out."""
+        ray = np.zeros(3 * WIDTH)
         mean: Array = self.count[used] @ self._mean[used] / max(1.0, self.count[used].sum())
-        ray: Array = mean * np.tile(_RAY, 3)
+        ray[self._features] = mean * np.tile(_RAY, 3)[self._features]
         return ray
 
     def weighted_mean(self, used: NDArray[np.bool_], ratio: float = np.inf) -> tuple[float, Array]:
         """Give what the used passes weigh together, and their mean (108,) so weighed."""
-        weight = self._weight(used, ratio)
-        total = float(weight.sum())
-        return total, weight / max(total, 1e-300) @ self._mean[used]
+        weight = self.weight(ratio)[used]
+        total, mean = float(weight.sum()), np.zeros(3 * WIDTH)
+        mean[self._features] = weight / max(total, 1e-300) @ self._mean[used]
+        return total, mean
 
-    def _weight(self, used: NDArray[np.bool_], ratio: float) -> Array:
-        weight: Array = self.count[used] / (1.0 + self.count[used] / ratio)
+    def weight(self, ratio: float = np.inf) -> Array:
+        """Give what each pass's mean weighs, (P,), in returns: see `form`."""
+        weight: Array = self.count / (1.0 + self.count / ratio)
         return weight
 
-    def left_out(self, number: int, rows: Array, used: NDArray[np.bool_], ratio: float = np.inf) -> float:
-        """Give Σ, m², of a pass's returns' way, in the rows (k, 108), from the other used passes' mean."""
-        others = used & (self.sites == self.sites[number])
-        others[number] = False
-        weight, mean = self.weighted_mean(others, ratio)
-        off = rows @ (self._mean[number] - mean) if weight else np.zeros(len(rows))
-        within = np.einsum("ki,ij,kj->", rows, self._within[number], rows)
-        return float(within + self.count[number] * off @ off)
+    def along(self, basis: Array, ratio: float) -> Along:
+        """Give these sums along rows (A, 108, M) of A axes: all that is to be known of their mixtures."""
+        there = np.ascontiguousarray(basis[:, self._features].swapaxes(0, 1))  # (K, A, M)
+        taken = self._within
+        if self._aside is not None and np.isfinite(ratio):
+            taken = taken - self._aside
+        return Along(
+            self.count,
+            self.weight(ratio),
+            self.sites,
+            np.tensordot(self._mean, there, 1),
+            _squares(self._within, there),
+            _squares(taken, there),
+            (self._mean * np.tile(_RAY, 3)[self._features]) @ there[:, 0],
+        )
 
     def means(self, rows: Array) -> Array:
         """Give each pass's mean (P, k) in the given rows (k, 108): `_rows` of a vector."""
-        means: Array = self._mean @ rows.T
+        means: Array = self._mean @ rows[:, self._features].T
         return means
 
     def yaw_rad(self) -> Array:
         """Give each pass's platform yaw (P,), rad, in the mean over its returns."""
-        forward = self._mean.reshape(-1, 3, WIDTH)[:, :, 6]  # the first column of C
+        first_of_c = np.zeros((2, 3 * WIDTH))
+        first_of_c[[0, 1], [6, WIDTH + 6]] = 1.0
+        forward = self.means(first_of_c)
         yaw: Array = np.arctan2(forward[:, 1], forward[:, 0])
         return yaw
 
     def within(self, rows: Array) -> Array:
         """Give each pass's variance within, (P,), m², the mean over the given rows (k, 108)."""
-        summed = np.einsum("ki,pij,kj->p", rows, self._within, rows)
+        there = rows[:, self._features]
+        summed = ((self._within @ there.T) * there.T).sum(axis=(1, 2))
         within: Array = np.maximum(0.0, summed) / np.maximum(1.0, self.count) / len(rows)
         return within
 
@@ -176,32 +198,75 @@ class Scatter:
         return off
 
 
+@dataclass(frozen=True, slots=True)
+class Along:
+    """A `Scatter` of P passes along M rows of each of A axes; a mixture of the rows is the same one of these.
+
+    ``count``, ``weight`` and ``sites`` are (P,), `Scatter`'s; ``mean`` is (P, A, M), ``within`` (P, M, M) the
+    sum about it over all axes, ``taken`` what `Scatter.form` takes of that, and ``ray`` (P, M) that of
+    `Scatter.ray`, along the first axis.
+    """
+
+    count: Array
+    weight: Array
+    sites: NDArray[np.int64]
+    mean: Array
+    within: Array
+    taken: Array
+    ray: Array
+
+    def joined(self, more: Along) -> Along:
+        """Give these passes and more."""
+        return Along(
+            *(np.concatenate([getattr(of, part.name) for of in (self, more)]) for part in fields(self))
+        )
+
+
+def _squares(matrices: Array, rows: Array) -> Array:
+    """Give Σ over axes of rowsᵀ M rows, (P, M, M), of (P, K, K) and (K, A, M)."""
+    passes, width = len(matrices), len(rows)
+    flat = rows.reshape(width, rows.shape[1] * rows.shape[2])
+    pulled = (matrices.reshape(passes * width, width) @ flat).reshape(passes, *rows.shape)
+    squares: Array = np.sum([rows[:, axis].T @ pulled[:, :, axis] for axis in range(rows.shape[1])], axis=0)
+    return squares
+
+
 def _each(sites: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
     """Give, site by site, which are of it."""
     return [sites == site for site in np.unique(sites)]
 
 
-def _aside(one: Moments) -> Array:
-    """Give what a return 1 m to the side of its mark adds to Σ f fᵀ, (108, 108), per m².
+def _of_range(features: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Say which features (K,) a range offset scales."""
+    of: NDArray[np.bool_] = (features % WIDTH >= RANGE.start) & (features % WIDTH < RANGE.stop)
+    return of
+
+
+def _aside(features: NDArray[np.int64], second: Array, per_return: Array) -> Array:
+    """Give what returns 1 m to the side of their mark add to P passes' Σ f fᵀ, (P, K, K), per m².
 
     A return m to the side is at a bearing m / r off. A range offset b moves it along its own beam, not its
     mark's, and so makes the spread (1 + b / r)² as wide: too short ranges look good. That it does is no
-    news of b. 1 / r on average is told by the means of r and r², as if ln r were normal.
+    news of b. 1 / r on average is told by the means of r and r², as if ln r were normal. All of that takes
+    all three axes.
     """
-    added = np.zeros((3, WIDTH, 3, WIDTH))
-    second = one.second.reshape(3, WIDTH, 3, WIDTH) / max(1, one.count)
-    ranged = second[:, RANGE][:, :, :, RANGE].reshape(3, 2, 3, 3, 2, 3)  # of [cos θ C | sin θ C]
-    across = one.count * ranged[:, ::-1][:, :, :, :, ::-1]  # of [-sin θ C | cos θ C], but for signs
-    across[:, 0, :, :, 1] *= -1.0
-    across[:, 1, :, :, 0] *= -1.0
+    added = np.zeros_like(second)
+    along = np.flatnonzero(_of_range(features))
+    if len(along) != 3 * 6:
+        return added
+    moved = np.searchsorted(features, features[along] - RANGE.start)
+    # The axis of n, [x or y], the axis of b: of [cos θ C | sin θ C] to [-sin θ C | cos θ C], but for signs.
+    across = second[:, along[:, None], along].reshape(-1, 3, 2, 3, 3, 2, 3)[:, :, ::-1, :, :, ::-1].copy()
+    across[:, :, 0, :, :, 1] *= -1.0
+    across[:, :, 1, :, :, 0] *= -1.0
     # Each of the three axes of C is of length 1.
-    r_m = float(np.einsum("aiai", second[:, :6, :, RANGE])) / 3
-    r_m2 = float(np.einsum("aiai", second[:, :6, :, :6])) / 3
-    per_m = r_m2 / r_m**3 if r_m > 0 else 0.0
-    both = per_m * across.reshape(3, 6, 3, 6)
-    added[:, :6, :, RANGE] = both
-    added[:, RANGE, :, :6] = both
-    return added.reshape(3 * WIDTH, 3 * WIDTH)
+    r_m = second[:, moved, along].sum(axis=1) * per_return / 3
+    r_m2 = second[:, moved, moved].sum(axis=1) * per_return / 3
+    per_m = np.divide(r_m2, r_m**3, out=np.zeros_like(r_m), where=r_m > 0)
+    both = per_m[:, None, None] * across.reshape(-1, 18, 18)
+    added[:, moved[:, None], along] = both
+    added[:, along[:, None], moved] = both
+    return added
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,6 +348,18 @@ class Form:
     balance: float = 1.0
     """What the variance of the ground counts against that of the pole; 1 is Eq. 7 to the letter."""
 
+    @classmethod
+    def of(cls, pole: Scatter, ground: Scatter, used: NDArray[np.bool_], weights: Weights = PAPER) -> Form:
+        """Take the used passes, weighed."""
+        return cls(
+            pole.form(used, weights.pole_ratio),
+            ground.form(used, weights.ground_ratio),
+            weights.rough_m2,
+            ground.ray(used) if weights.rough_m2 else None,
+            ground.within_form(used) if weights.rough_m2 and weights.ground_return else None,
+            weights.balance(pole.count[used].sum(), ground.count[used].sum()),
+        )
+
     def spread(self, vector: Array) -> float:
         """Give the quadratic part of c in m² at ``vector`` (12,), the variances of Eq. 7 in balance."""
         h = _h(vector)
@@ -363,6 +440,35 @@ class Form:
         height: Array = self.ray @ np.kron(_ground_weights(vector)[0].T, _h_base(vector))
         return height
 
+    def bend(self, vector: Array) -> Array:
+        """Give what half the Hessian (12, 12) has beyond `slope`'s: of how the rows themselves bend."""
+        h = _h(vector)
+        dh = _h_gradient(vector, h)
+        bending = range(3, 8)  # h⁺ is bent by the angles and by what scales it
+        bent = np.zeros((WIDTH, len(UNKNOWNS), len(UNKNOWNS)))
+        for index in bending:
+            step = _STEP * (np.arange(len(UNKNOWNS)) == index)
+            ends = [_h_gradient(end, _h(end)) for end in (vector + step, vector - step)]
+            bent[:, :, index] = (ends[0] - ends[1]) / (2 * _STEP)
+        bent[:, bending, :3] = bent[:, :3, bending].swapaxes(1, 2)
+        down = ground_rows(vector)[0]
+        pull = self.ground @ down
+        if self.ray is not None:
+            pull = pull - self.rough_m2 * self.ray / (self.ray @ down)
+        if self.bumps is not None:
+            bumps = self.bumps @ down
+            pull = pull + (self.rough_m2 / max(float(down @ bumps), 1e-300) - 1.0) * bumps
+        pulls = [self.pole @ row for row in pole_rows(vector)] + [self.balance * pull]
+        every = (
+            np.concatenate(of) for of in zip(_pole_weights(vector), _ground_weights(vector), strict=True)
+        )
+        added = np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
+        for of_axis, weight, dweight in zip(pulls, *every, strict=True):
+            of = of_axis.reshape(3, WIDTH)
+            both = dweight.T @ of @ dh
+            added += np.tensordot(weight @ of, bent, 1) + both + both.T
+        return added
+
     def _half_slopes(self, vector: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], Array | None]:
         """Give `_half_slope` of both kinds, and on rough ground the derivative (12,) of ln of its height."""
         h = _h(vector)
@@ -405,6 +511,23 @@ def pole_rows(vector: Array) -> Array:
 def ground_rows(vector: Array) -> Array:
     """Give what turns features into down of the ground, its slope taken off: (1, 108)."""
     return _rows(_ground_weights(vector)[0], _h(vector))
+
+
+def pole_basis(vector: Array) -> Array:
+    """Give `pole_rows`, and their derivatives by the unknowns: (2, 108, 1 + 12)."""
+    return _basis(*_pole_weights(vector), vector)
+
+
+def ground_basis(vector: Array) -> Array:
+    """Give `ground_rows`, and their derivatives by the unknowns: (1, 108, 1 + 12)."""
+    return _basis(*_ground_weights(vector), vector)
+
+
+def _basis(weights: Array, dweights: Array, vector: Array) -> Array:
+    h = _h(vector)
+    dh = _h_gradient(vector, h)
+    slopes = [_jacobian(weight, dweight, h, dh) for weight, dweight in zip(weights, dweights, strict=True)]
+    return np.concatenate([_rows(weights, h)[:, :, None], np.stack(slopes)], axis=2)
 
 
 def _rows(weights: Array, h: Array) -> Array:

@@ -6,16 +6,17 @@ import math
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from polecal.calib import CalibrationError, Kind, Pass, Returns
-from polecal.calib.moments import Moments
+from polecal.calib.moments import Moments, of_sums
 from polecal.daemon import config as configuration
 from polecal.daemon import facts, recorder
 from polecal.daemon.choices import Choice
@@ -139,13 +140,8 @@ def read_pass(path: Path) -> Kept:
     """Read a pass's file, also of a version that wrote less into it. Raises SessionError."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            blocks = {
-                (int(part), Kind(int(kind))): Moments(int(count), first, second)
-                for (part, kind), count, first, second in zip(
-                    *(file[f"block_{name}"] for name in ("slice_kind", "count", "first", "second")),
-                    strict=True,
-                )
-            }
+            keys = [(int(part), Kind(int(kind))) for part, kind in file["block_slice_kind"]]
+            blocks = dict(zip(keys, _blocks(file), strict=True))
             site = int(file["site"]) if "site" in file else 0
             gps_ns = file["gps_ns"]
             if "direction" in file:
@@ -158,9 +154,29 @@ def read_pass(path: Path) -> Kept:
                 quality = Quality()
             first_ns, last_ns = file["t_ns"].tolist()
             number = int(path.stem.rpartition("-")[2])
-            return Kept(int(file["place"]), (first_ns, last_ns), Pass(number, blocks, site), about, quality)
+            return Kept(
+                int(file["place"]), (first_ns, last_ns), Pass.of(number, blocks, site), about, quality
+            )
     except DAMAGE as error:
         raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
+
+
+def _blocks(file: Mapping[str, NDArray[Any]]) -> list[Moments]:
+    """Read blocks of sums."""
+    counts, firsts = file["block_count"].tolist(), file["block_first"]
+    if "block_packed" not in file:  # as polecal wrote before 2026-11: all features, whole matrices
+        every = np.arange(firsts.shape[1])
+        return [
+            of_sums(*each)
+            for each in zip(counts, [every] * len(counts), firsts, file["block_second"], strict=True)
+        ]
+    features = [np.flatnonzero(has) for has in file["block_features"]]
+    ends = np.cumsum([len(has) * (len(has) + 1) // 2 for has in features])
+    packed = np.split(file["block_packed"], ends[:-1])
+    return [
+        Moments(count, has, first[has], sums)
+        for count, has, first, sums in zip(counts, features, firsts, packed, strict=True)
+    ]
 
 
 def _origin(content: dict[str, Any]) -> tuple[float, float, float] | None:

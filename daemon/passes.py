@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polecal.calib import Kind, Mount, Pass, Returns, points_nav
-from polecal.calib.estimate import split
+from polecal.calib.estimate import Blocks, split
 from polecal.calib.segment import even_ground
 from polecal.daemon import facts
 from polecal.daemon.facts import Facts
@@ -43,7 +43,7 @@ class Kept:
 
 @dataclass(frozen=True, slots=True)
 class StoredPass:
-    """A closed pass: its returns with their GPS times, and their moments."""
+    """A closed pass: its returns with their GPS times, and their moments, by slice and in all."""
 
     id: int
     place: int
@@ -52,6 +52,7 @@ class StoredPass:
     gps_ns: NDArray[np.int64]
     """(N,) GPS time of each return."""
     returns: Returns
+    blocks: Blocks
     moments: Pass
     facts: Facts
     quality: Quality = field(default_factory=Quality)
@@ -121,6 +122,7 @@ class PassBuilder:
             self.uneven += int(np.count_nonzero(~kept))
             if not kept.all():
                 gps_ns, returns = gps_ns[kept], returns[kept]
+            blocks = split(returns, self._slice_deg)
             closed.append(
                 StoredPass(
                     id=self._count,
@@ -128,7 +130,8 @@ class PassBuilder:
                     t_ns=(one.first_ns, one.last_ns),
                     gps_ns=gps_ns,
                     returns=returns,
-                    moments=Pass(self._count, split(returns, self._slice_deg), self._site),
+                    blocks=blocks,
+                    moments=Pass.of(self._count, blocks, self._site),
                     facts=facts.of(returns, gps_ns),
                 )
             )

@@ -295,7 +295,7 @@ def _to_know_more(setup: Setup, entry: Mapping[str, Any]) -> str:
 def _anew(name: str, setup: Setup, seen: Sequence[Seen], notes: list[str]) -> dict[str, Any]:
     """Calibrate for the report alone, where the run did not: never as accepted."""
     used = [
-        Pass(one.id, split(one.returns, setup.need.slice_deg), one.site) for one in seen if not one.why_not
+        Pass.of(one.id, split(one.returns, setup.need.slice_deg), one.site) for one in seen if not one.why_not
     ]
     try:
         result = estimate(used, setup, everywhere=True) if used else None
@@ -365,7 +365,7 @@ def _pole_of(
         return {(one["site"], one["place"]) for one in entry["reflectors"]}
     counts: dict[tuple[int, int], Counter[int]] = {}
     for where, returns in stored:
-        one = Pass(0, split(returns[returns.kind == 0], setup.need.slice_deg))
+        one = Pass.of(0, split(returns[returns.kind == 0], setup.need.slice_deg))
         counts.setdefault(where, Counter()).update(one.pole_returns)
     enough = setup.need.min_pole_returns
     best = {

@@ -28,9 +28,8 @@ def use_of(
 
 def row(laser: str, one: Kept, use: str, why: str, residual: Residual | None) -> dict[str, Any]:
     """Give a pass as PASSES tells it."""
-    blocks = one.moments.blocks
-    slices = sorted({part for part, _ in blocks})
-    count = {key: block.count for key, block in blocks.items()}
+    count = one.moments.counts
+    slices = sorted({part for part, _ in count})
     about, quality = one.facts, one.quality
     return {
         "name": name_of(laser, one.id),

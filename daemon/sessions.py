@@ -21,6 +21,7 @@ import structlog
 import yaml
 
 from polecal import PolecalError, __version__
+from polecal.calib.moments import WIDTH
 from polecal.daemon.config import Config, dump
 from polecal.daemon.facts import utc
 from polecal.daemon.passes import StoredPass
@@ -79,7 +80,11 @@ class Session:
     def write_pass(self, laser: str, stored: StoredPass) -> None:
         """Write a closed pass. Raises SessionError."""
         returns = stored.returns
-        blocks = stored.moments.blocks
+        blocks = stored.blocks
+        features = np.zeros((len(blocks), 3 * WIDTH), dtype=bool)
+        first = np.zeros((len(blocks), 3 * WIDTH))
+        for has, sums, block in zip(features, first, blocks.values(), strict=True):
+            has[block.features], sums[block.features] = True, block.first
         about, quality = stored.facts, stored.quality
         arrays: dict[str, Any] = {
             "t_ns": stored.t_ns,
@@ -93,8 +98,9 @@ class Session:
             **{part.name: getattr(returns, part.name) for part in fields(returns)},
             "block_slice_kind": [(part, int(kind)) for part, kind in blocks],
             "block_count": [block.count for block in blocks.values()],
-            "block_first": np.stack([block.first for block in blocks.values()]),
-            "block_second": np.stack([block.second for block in blocks.values()]),
+            "block_features": features,
+            "block_first": first,
+            "block_packed": np.concatenate([block.packed for block in blocks.values()]),
         }
         with _whole_file(self.folder / "passes" / f"{laser}-{stored.id:03d}.npz") as file:
             _save(file, arrays)

@@ -120,7 +120,7 @@ def gather(
             ]
         )
     fixed = replace(setup, hold=frozenset({*setup.hold, *held}), extras=frozenset(extras) & frozenset(EXTRAS))
-    passes = [replace(Pass(one.id, split(one.returns, setup.need.slice_deg)), site=one.site) for one in used]
+    passes = [Pass.of(one.id, split(one.returns, setup.need.slice_deg), one.site) for one in used]
     counts = np.cumsum([len(one.returns) for one in used])
     return Evidence(
         before=clouds[0],

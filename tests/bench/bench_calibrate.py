@@ -109,13 +109,13 @@ def a_scan_more(returns: Returns) -> Iterator[tuple[str | float, ...]]:
 def memory(returns: Returns) -> Iterator[tuple[str | float, ...]]:
     """As many passes, each a hundred times as long."""
     some = returns[np.sort(np.random.default_rng(0).choice(len(returns), 400_000, replace=False))]
-    kept: dict[tuple[int, int, Kind], Moments] = {}
+    kept: dict[tuple[int, Kind], Moments] = {}
 
     def feed() -> float:
         for one in passes_of(some, 30):
-            for (part, kind), block in one.blocks.items():
-                before = kept.get((one.id, part, kind))
-                kept[one.id, part, kind] = block if before is None else before + block
+            for kind, total in one.totals.items():
+                before = kept.get((one.id, kind))
+                kept[one.id, kind] = total if before is None else before + total
         gc.collect()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         return pages * 4096 / 1e6

@@ -23,7 +23,7 @@ def passes():
 
 
 def form_of(passes, **told):
-    pole, ground = (scatter_of([one.total(kind) for one in passes], kind, 0.04) for kind in Kind)
+    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.04) for kind in Kind)
     used = np.ones(len(passes), dtype=bool)
     asked = {"pass_error": True, "rough": True, "by_kind": False} | told
     weights = Weights.told(pole, ground, used, START, **asked)
@@ -111,7 +111,7 @@ def test_nothing_is_proven_where_the_sensor_is_in_the_ground(passes):
 
 def test_a_perfect_fit_is_the_lowest(rig):
     passes = passes_of(rig.drive(), 30)
-    pole, ground = (scatter_of([one.total(kind) for one in passes], kind, 0.0) for kind in Kind)
+    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.0) for kind in Kind)
     every = np.ones(len(passes), dtype=bool)
     form = Form(pole.form(every), ground.form(every))
     found = minimise_globally(form, START, EXTRAS)

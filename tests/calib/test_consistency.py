@@ -59,7 +59,7 @@ def test_passes_left_out_cost_what_the_cloud_says(rig):
             mean = points[number != one.id][:, axes].mean(axis=0)
             squares[kind] += ((points[number == one.id][:, axes] - mean) ** 2).sum()
     by_hand = sum(squares[kind] / np.count_nonzero(returns.kind == kind) for kind in Kind)
-    assert whole.left_out_m == pytest.approx(np.sqrt(by_hand), rel=1e-6)
+    assert whole.left_out_m == pytest.approx(np.sqrt(by_hand), rel=1e-4)
     assert whole.left_out_m > whole.cost_m == pytest.approx(cost(returns, whole.mount))
 
 

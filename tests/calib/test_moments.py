@@ -68,12 +68,30 @@ def test_what_is_not_asked_for_is_left_out_and_the_rest_the_same(returns):
         angular_acceleration_radps2=still,
     )
     every = np.arange(len(returns))
-    whole = m.of(moving).first.reshape(3, m.WIDTH)
-    least = m.by_group(moving, every, 0 * every, ranged=False, timed=False)[0].first.reshape(3, m.WIDTH)
-    np.testing.assert_array_equal(least[:, m.BASE], whole[:, m.BASE])
-    assert whole[:, m.RANGE].any()
-    assert whole[:, m.TIME].any()
-    assert not least[:, m.RANGE.start :].any()
+    whole = m.of(moving)
+    least = m.by_group(moving, every, 0 * every, axes=(m.DOWN,), ranged=False, timed=False)[0]
+    assert least.features.tolist() == list(range(2 * m.WIDTH, 2 * m.WIDTH + m.BASE.stop))
+    np.testing.assert_allclose(least.mean()[m.DOWN, m.BASE], whole.mean()[m.DOWN, m.BASE], rtol=1e-12)
+    there = np.ix_(least.features, least.features)
+    np.testing.assert_allclose(least.second, whole.second[there], rtol=1e-12, atol=1e-9)
+    assert whole.mean()[:, m.RANGE].all()
+    assert whole.mean()[:, m.TIME].any()
+
+
+def test_moments_of_unlike_features_add_up_as_if_what_is_missing_were_nothing(returns):
+    every = np.arange(len(returns))
+    low, flat = (
+        m.by_group(returns, every, 0 * every, axes=axes, ranged=False)[0]
+        for axes in ((m.DOWN,), (m.NORTH, m.EAST))
+    )
+    both = low + flat
+    assert both.count == 2 * len(returns)
+    np.testing.assert_array_equal(both.mean()[m.DOWN], low.mean()[m.DOWN] / 2)
+    assert np.array_equal((both - low).second[:20, :20], flat.second)
+    features, first, second = m.stacked([low, flat, m.zero()])
+    assert np.array_equal(features, both.features)
+    np.testing.assert_array_equal(first.sum(axis=0), both.first)
+    np.testing.assert_array_equal(second.sum(axis=0), both.second)
 
 
 def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):
@@ -102,4 +120,4 @@ def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):
 
 def test_no_returns_cost_nothing():
     assert m.zero().count == 0
-    assert not m.zero().covariance().any()
+    assert not m.zero().mean().any()

@@ -93,7 +93,7 @@ def test_pole_and_ground_are_where_the_passes_saw_them():
     range_m = -origin[:, 2] / down
     kind = np.full(count, Kind.GROUND, dtype=np.uint8)
     returns = Returns(range_m, bearing, position, rpy, kind, np.zeros(count, dtype=np.int64))
-    low, high = ground_of(mount, [Pass(1, split(returns, 30))])
+    low, high = ground_of(mount, [Pass.of(1, split(returns, 30))])
     assert low == high == pytest.approx(GROUND_M, abs=0.002)
     # And as many that end on a pole, a level sensor's
     flat = Mount(0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
@@ -101,7 +101,7 @@ def test_pole_and_ground_are_where_the_passes_saw_them():
     to_pole = np.array([12.0, -7.0]) - position[:, :2]
     ranges, course = np.linalg.norm(to_pole, axis=1), np.arctan2(to_pole[:, 1], to_pole[:, 0])
     seen = Returns(ranges, course - level[:, 2], position, level, 0 * kind, returns.pass_id)
-    assert pole_at(flat, [Pass(1, split(seen, 30))]) == pytest.approx((12.0, -7.0), abs=1e-6)
+    assert pole_at(flat, [Pass.of(1, split(seen, 30))]) == pytest.approx((12.0, -7.0), abs=1e-6)
 
 
 def test_without_a_pass_the_ground_may_be_anywhere_below_the_laser():

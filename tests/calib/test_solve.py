@@ -13,7 +13,7 @@ ROUGH_M2 = 0.03**2
 @pytest.fixture(scope="module")
 def form(rig):
     passes = passes_of(rig.drive(passes=12, noise_m=0.01, nav_m=0.01, radius_m=0.04), 30)
-    pole, ground = (scatter_of([one.total(kind) for one in passes], kind, 0.04) for kind in Kind)
+    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.04) for kind in Kind)
     return Form(pole.form(EVERY, 3.0), ground.form(EVERY, 50.0), ROUGH_M2, ground.ray(EVERY))
 
 

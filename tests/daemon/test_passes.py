@@ -90,11 +90,11 @@ def test_a_closed_pass_has_the_moments_of_its_returns(builder):
     seen(builder, 0, [1.0, 1.1, 1.2])
     (one,) = builder.close(MOUNT)
     again = split(one.returns, 30)
-    assert one.moments.blocks.keys() == again.keys()
-    assert sum(block.count for block in one.moments.blocks.values()) == len(one.returns)
+    assert one.blocks.keys() == one.moments.counts.keys() == again.keys()
+    assert sum(one.moments.counts.values()) == len(one.returns)
     assert sum(one.moments.pole_returns.values()) == 30
     for key, block in again.items():
-        assert np.array_equal(one.moments.blocks[key].second, block.second)
+        assert np.array_equal(one.blocks[key].packed, block.packed)
 
 
 def test_joining_keeps_order_and_every_column():

@@ -137,9 +137,11 @@ def test_a_stored_pass_has_its_times_returns_and_moments(recorded):
             assert np.array_equal(file[name], getattr(one.returns, name))
         blocks = split(one.returns, 30)
         assert {tuple(row) for row in file["block_slice_kind"].tolist()} == {(s, int(k)) for s, k in blocks}
-        for row, count, second in zip(
-            file["block_slice_kind"], file["block_count"], file["block_second"], strict=True
+        assert file["block_count"].tolist() == [block.count for block in one.blocks.values()]
+        for has, first, block in zip(
+            file["block_features"], file["block_first"], one.blocks.values(), strict=True
         ):
-            block = blocks[int(row[0]), type(next(iter(blocks))[1])(int(row[1]))]
-            assert count == block.count
-            assert np.array_equal(second, block.second)
+            assert np.array_equal(first[has], block.first)
+        assert np.array_equal(
+            file["block_packed"], np.concatenate([block.packed for block in one.blocks.values()])
+        )

@@ -31,7 +31,7 @@ def test_memory_is_flat_but_for_the_sums_of_each_pass(begun, settings, t0_ns, te
         play({"front": laser, "span": receiver}, start_ns=t0_ns, seconds=130.0, chunk_s=0.1, jitter_s=3e-4)
     )
     played = begun(config)
-    held_kb, blocks_kb, passes = [], [], []
+    held_kb, sums_kb, passes = [], [], []
     waiting, builder = iter(chunks), played.pipeline._lasers["front"].channel._builder
     tracemalloc.start()
     try:
@@ -44,13 +44,13 @@ def test_memory_is_flat_but_for_the_sums_of_each_pass(begun, settings, t0_ns, te
             gc.collect()
             held_kb.append(tracemalloc.get_traced_memory()[0] / 1e3)
             kept = played.pipeline._lasers["front"].passes
-            blocks = [block for one in kept for block in one.moments.blocks.values()]
-            blocks_kb.append(sum(block.first.nbytes + block.second.nbytes for block in blocks) / 1e3)
+            sums = [total for one in kept for total in one.moments.totals.values()]
+            sums_kb.append(sum(each.first.nbytes + each.packed.nbytes for each in sums) / 1e3)
             passes.append(len(kept))
     finally:
         tracemalloc.stop()
     more = passes[1] - passes[0]
-    grown_kb, of_blocks_kb = held_kb[1] - held_kb[0], blocks_kb[1] - blocks_kb[0]
-    tell(f"{more} passes: {grown_kb:.0f} kB more, of which their blocks are {of_blocks_kb:.0f} kB")
+    grown_kb, of_sums_kb = held_kb[1] - held_kb[0], sums_kb[1] - sums_kb[0]
+    tell(f"{more} passes: {grown_kb:.0f} kB more, of which their sums are {of_sums_kb:.0f} kB")
     assert more > 3
-    assert grown_kb - of_blocks_kb < 20 * more + 200
+    assert grown_kb - of_sums_kb < 20 * more + 200
