@@ -85,9 +85,10 @@ class Subsets:
         return float(np.sqrt(max(0.0, total)))
 
     def sides(self, subsets: NDArray[np.bool_]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Give what pole and ground, unbalanced, say of B subsets: half gradients and information, at the vector.
+        """Give what pole and ground, each by itself, say of B subsets at the vector.
 
-        They are (B, M) and, as `solve.Form.information`, (B, M, M), M the free unknowns.
+        Half the gradients and, as `solve.Form.information`, half the Hessians: (B, M) and (B, M, M), M the
+        free unknowns.
         """
         parts = subsets.astype(np.float64)
         pole, ground = (_form(along, parts)[:, 1:] for along in (self.pole, self.ground))
