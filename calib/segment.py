@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,23 +53,33 @@ def reflectors(
     bright = np.flatnonzero((reflectivity >= RETRO_REFLECTIVE) & np.isfinite(range_m))
     if not len(bright):
         return []
-    apart = (np.diff(bright) > _MARGIN_BEAMS) | (np.abs(np.diff(range_m[bright])) > _STEP_M)
     step_rad = abs(float(bearing_rad[1] - bearing_rad[0]))
     found = []
-    for together in np.split(bright, np.flatnonzero(apart) + 1):
+    for together in _together(bright, range_m[bright]):
         if together[0] == 0 or together[-1] == len(range_m) - 1:
             continue
-        beams = together
-        distance_m = float(range_m[beams].mean())
+        beams, ranges_m = together, range_m[together]
+        distance_m = float(ranges_m.mean())
         width_m = distance_m * (abs(float(bearing_rad[beams[-1]] - bearing_rad[beams[0]])) + step_rad)
         widest_m = 2 * pole_radius_m + _SPREAD_BEAMS * step_rad * distance_m + _SPREAD_M
         thin = width_m <= widest_m
         if thin:  # a beam on its edge sees half of it and half of what is behind, at a range between
-            core_m = np.sort(range_m[beams])[(len(beams) - 1) // 2]
-            beams = beams[np.abs(range_m[beams] - core_m) <= pole_radius_m + _BEHIND_M]
-            distance_m = float(range_m[beams].mean())
+            core_m = sorted(ranges_m.tolist())[(len(beams) - 1) // 2]
+            core = np.abs(ranges_m - core_m) <= pole_radius_m + _BEHIND_M
+            beams, distance_m = beams[core], float(ranges_m[core].mean())
         found.append(Reflector(beams, distance_m, thin))
     return found
+
+
+def _together(bright: Indices, range_m: Array) -> list[Indices]:
+    """Part bright beams (N,) at (N,) ranges into those that lie beside one another."""
+    numbers, ranges_m = bright.tolist(), range_m.tolist()  # a few: lists take a quarter of arrays' time
+    starts = [
+        at
+        for at in range(1, len(numbers))
+        if numbers[at] - numbers[at - 1] > _MARGIN_BEAMS or abs(ranges_m[at] - ranges_m[at - 1]) > _STEP_M
+    ]
+    return [bright[begin:end] for begin, end in zip([0, *starts], [*starts, len(numbers)], strict=True)]
 
 
 @dataclass(slots=True)
@@ -123,17 +134,22 @@ class Ground:
 
     _levels_m: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY_SCANS))
 
-    def beams(self, range_m: Array, reflectivity: Array, down_m: Array) -> Indices:
-        """Find the ground among a scan's (N,) returns, ``down_m`` their z in n; NaN where there is none."""
-        bright = np.flatnonzero(reflectivity > _DULL)
-        edge = (bright[:, None] + np.arange(-_MARGIN_BEAMS, _MARGIN_BEAMS + 1)).ravel()
-        dull = np.isfinite(range_m) & (range_m <= _GROUND_RANGE_M)
-        dull[edge[(edge >= 0) & (edge < len(dull))]] = False
-        if not dull.any():
-            return np.zeros(0, dtype=np.int64)
-        self._levels_m.append(float(np.median(down_m[dull])))
-        level_m = float(np.median(self._levels_m))
-        return np.flatnonzero(dull & (np.abs(down_m - level_m) <= _GROUND_BAND_M))
+    def beams(self, range_m: Array, reflectivity: Array, down_m: Array) -> NDArray[np.bool_]:
+        """Say which of K scans' (K, N) returns are it, ``down_m`` their z in n; NaN where there is none."""
+        bright = reflectivity > _DULL
+        dull = np.isfinite(range_m) & (range_m <= _GROUND_RANGE_M) & ~bright
+        for aside in range(1, _MARGIN_BEAMS + 1):
+            dull[:, aside:] &= ~bright[:, :-aside]
+            dull[:, :-aside] &= ~bright[:, aside:]
+        ordered = np.sort(np.where(dull, down_m, np.inf), axis=1)
+        level_m = np.zeros(len(dull))
+        for number, count in enumerate(dull.sum(axis=1).tolist()):
+            if count:
+                middle = ordered[number, [(count - 1) // 2, count // 2]]
+                self._levels_m.append(float(middle.sum()) / 2)
+                level_m[number] = median(self._levels_m)
+        ground: NDArray[np.bool_] = dull & (np.abs(down_m - level_m[:, None]) <= _GROUND_BAND_M)
+        return ground
 
 
 def even_ground(range_m: Array, bearing_rad: Array, down_m: Array) -> NDArray[np.bool_]:

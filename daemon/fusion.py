@@ -63,6 +63,9 @@ class _Waiting:
     found: list[Reflector]
 
 
+_Sighting = tuple[int, NDArray[np.int64]]  # stamp of a scan, its rows
+
+
 class LaserChannel:
     """Takes a laser's chunks, and gives passes as soon as the trajectory has come as far."""
 
@@ -228,15 +231,16 @@ class LaserChannel:
         bearing_rad = np.tile(self._bearing_rad, len(scans))
         every = observed(np.nan_to_num(range_m).ravel(), bearing_rad, poses, kind)
         points = points_nav(every, self.mount).reshape(*gps_ns.shape, 3)
-        seen: defaultdict[int, list[tuple[int, NDArray[np.int64]]]] = defaultdict(
-            list
-        )  # by place: stamp, rows
-        for number in np.flatnonzero(~standing).tolist():
+        moving = np.flatnonzero(~standing)
+        reflectivity = np.stack([scan.reflectivity for scan in scans])[moving]
+        ground = self._ground.beams(range_m[moving], reflectivity, points[moving, :, 2])
+        seen: defaultdict[int, list[_Sighting]] = defaultdict(list)  # by place
+        for number, on_ground in zip(moving.tolist(), ground, strict=True):
             scan, first = scans[number], number * len(self._bearing_rad)
-            ground = self._ground.beams(range_m[number], scan.reflectivity, points[number, :, 2])
             for place, beams in self._sighted(scan, known[number], points[number]).items():
                 kind[first + beams] = Kind.POLE  # of ``every``, too
-                seen[place].append((scan.stx_ns, first + np.concatenate([beams, ground])))
+                rows = first + np.concatenate([beams, np.flatnonzero(on_ground)])
+                seen[place].append((scan.stx_ns, rows))
         for place, parts in seen.items():
             rows = np.concatenate([part for _, part in parts])
             self._builder.add(place, (parts[0][0], parts[-1][0]), gps_ns.ravel()[rows], every[rows])
