@@ -120,7 +120,7 @@ class Returns:
                 raise CalibrationError(
                     f"{name} holds values that are not finite", "leave out beams without a range"
                 )
-        if np.isin(self.kind, list(Kind), invert=True).any():
+        if ((self.kind != Kind.POLE) & (self.kind != Kind.GROUND)).any():
             raise CalibrationError(
                 "kind holds values that are neither pole (0) nor ground (1)", "leave them out"
             )

@@ -118,7 +118,7 @@ QUALITY = tuple(part.name for part in fields(Quality))
 """What a pass's file has of `Facts` and `Quality`, under the same names."""
 
 
-_SAMPLE_BYTES = 8192  # two scans of a column
+_SAMPLE_BYTES = 8192  # two scans of a column: what is shorter is not worth asking
 _WORTH_IT = 0.4  # of its size: poses and moments are all digits, which costs much time and gains a tenth
 
 
@@ -130,7 +130,9 @@ def _save(file: IO[bytes], arrays: dict[str, Any]) -> None:
             np.lib.format.write_array(column, np.asarray(value), allow_pickle=False)
             content = column.getvalue()
             sample = content[len(content) // 2 :][:_SAMPLE_BYTES]
-            worth_it = len(zlib.compress(sample, 1)) < _WORTH_IT * len(sample)
+            worth_it = len(content) > _SAMPLE_BYTES and len(zlib.compress(sample, 1)) < _WORTH_IT * len(
+                sample
+            )
             method = zipfile.ZIP_DEFLATED if worth_it else zipfile.ZIP_STORED
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content, method, compresslevel=1)
 
