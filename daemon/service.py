@@ -36,7 +36,7 @@ _CLOSE_S = 60.0  # so long a disk may take to close a capture,
 _EXTEND_S = 5.0  # of which so much is asked for at a time
 _PAGE_ROWS = 48  # of at most 1 KiB each
 _CALIBRATED = (State.ACCEPTED, State.REJECTED)
-_SWITCH_S = 2e-4  # a chunk is stamped once its reader has the interpreter: so long it waits for a calculation
+_SWITCH_S = 1e-4  # a chunk is stamped once its reader has the interpreter: so long it waits for a calculation
 _ABOUT = "The daemon that calibrates the pose of a vehicle's lasers, in the foreground."
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")
 

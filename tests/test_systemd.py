@@ -104,7 +104,7 @@ def test_paths_are_those_of_the_configuration():
 def test_a_protection_that_is_off_is_given_a_reason_in_the_unit():
     text = UNIT.read_text()
     said = " ".join(line for line in text.splitlines() if line.startswith("#"))
-    for key in ("PrivateDevices=", "PrivateUsers=", "RootDirectory="):
+    for key in ("PrivateDevices=", "PrivateUsers=", "RootDirectory=", "RestrictRealtime="):
         assert f"\n{key}" not in text
         assert key in said
     assert "AF_UNIX is on" in said

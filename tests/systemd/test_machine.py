@@ -3,6 +3,7 @@
 import json
 import re
 import time
+from os import SCHED_OTHER, SCHED_RR
 
 import pytest
 import yaml
@@ -30,6 +31,21 @@ def test_it_comes_up_ready_hardened_and_says_what_to_do(polecal):
     assert "usermod -aG polecal" in refused.stderr
     assert "asked" in polecal.journal
     assert "uid=0 request=STATUS" in polecal.journal
+
+
+def test_what_reads_the_lines_goes_before_all_else(polecal):
+    # in place of LimitRTPRIO=, which in a container even root may not raise; all else is as in the unit
+    may = "[Service]\nCapabilityBoundingSet=CAP_SYS_NICE\nAmbientCapabilities=CAP_SYS_NICE\n"
+    drop_in = polecal.path("/etc/systemd/system/polecal.service.d/may.conf")
+    drop_in.parent.mkdir()
+    drop_in.write_text(may)
+    polecal.systemctl("daemon-reload")
+    polecal.systemctl("start", "polecal")
+    polecal.collecting()
+    tasks = polecal.path(f"/proc/{polecal.show('MainPID')}/task").glob("*/stat")
+    policies = [int(task.read_text().rpartition(")")[2].split()[38]) for task in tasks]  # proc(5), field 41
+    assert policies.count(SCHED_RR) == 2
+    assert set(policies) == {SCHED_RR, SCHED_OTHER}
 
 
 def test_a_bad_configuration_is_said_and_not_tried_again(polecal):
