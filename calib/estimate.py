@@ -337,6 +337,8 @@ class _Found:
     covariance: Array
     held: frozenset[str]
     form: Form
+    bend: Array
+    """`Form.bend` near the minimum."""
     subsets: Subsets | None
     """The passes near the minimum; None where there are too few."""
     left_out: Array | None
@@ -362,7 +364,7 @@ class _Problem:
         numbers = np.flatnonzero(used)
         enough = len(numbers) >= FEWEST_PASSES
         held = {*setup.hold, *EXTRAS} - (setup.extras if enough else set())
-        paper, weights = self._form(used), PAPER
+        paper, weights, about = self._form(used), PAPER, measured
         if (setup.pass_error or setup.rough_ground) and enough:  # fixed from here on
             about = solve.minimise(paper, measured, held)
             weights = Weights.told(
@@ -381,20 +383,22 @@ class _Problem:
         believable[2] = min(believable[2], setup.criteria.max_sigma[2])
         if weights.ground_return is not None:
             known = max(paper.spread(about), _LEAST_M**2) / self.pole.count[used].sum() / believable**2
-            near = Subsets.near(self.pole, self.ground, weights, about, ~_mask(held), bend=whole.bend(about))
+            near = Subsets.near(self.pole, self.ground, weights, about, ~_mask(held))
             less = balance(near, _each_but_one(used), known, whole.balance) / whole.balance
             weights = replace(weights, ground_return=less * weights.ground_return)
             whole = replace(whole, balance=less * whole.balance)
         search = solve.minimise_globally if everywhere else solve.minimise
-        vector = measured
+        at_measured = whole.information(measured)
+        vector, bend = about, None
         while True:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
             squared = max((paper if weights.ground_return else whole).spread(vector), _LEAST_M**2)
+            bend = whole.bend(vector) if bend is None else bend
             subsets = left_out = None
             if enough:
-                subsets = Subsets.near(self.pole, self.ground, weights, vector, free, bend=whole.bend(vector))
-                left_out = subsets.minima(_each_but_one(used))
+                subsets = Subsets.near(self.pole, self.ground, weights, vector, free)
+                left_out = subsets.minima(_each_but_one(used), bend)
                 covariance = jackknife(left_out)
             else:
                 covariance = from_model(whole.information(vector), squared, len(numbers), free)
@@ -403,16 +407,15 @@ class _Problem:
             # pitch stretches the ranges, and noise puts it there. So it must be told at the measured mount,
             # too.
             count = int(self.pole.count[used].sum())
-            best = [
-                np.diag(from_model(whole.information(at), squared, count, free)) for at in (vector, measured)
-            ]
+            informations = whole.information(vector), at_measured
+            best = [np.diag(from_model(of, squared, count, free)) for of in informations]
             doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*best))) / believable
             if not enough:  # few passes can be fitted by a mount that cannot be: it is not their noise
                 far = np.abs(vector - measured) / (_FARTHEST * self._measured_sigma)
                 doubt = np.maximum(doubt, far * free)
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
-                return _Found(vector, covariance, frozenset(held), whole, subsets, left_out)
+                return _Found(vector, covariance, frozenset(held), whole, bend, subsets, left_out)
             held.add(UNKNOWNS[worst])
 
     def oddest(self, used: NDArray[np.bool_], vector: Array) -> tuple[int, str] | None:
@@ -461,7 +464,7 @@ class _Problem:
             some = np.zeros((3, len(used)), dtype=bool)
             for row, numbers in zip(some, (order[:-_LAST_PASSES], turned[::2], turned[1::2]), strict=True):
                 row[numbers] = True
-            costs_m = [solve.cost_m(paper, minimum) for minimum in found.subsets.minima(some)]
+            costs_m = [solve.cost_m(paper, minimum) for minimum in found.subsets.minima(some, found.bend)]
             last, *halves = (part_m / cost_m - 1.0 if cost_m else 0.0 for part_m in costs_m)
             improvement, doubling = last, float(np.mean(halves))
         slices = coverage([one.pole_returns for one in passes], setup.need)

@@ -47,9 +47,12 @@ def _row(axis: int, cosines: Sequence[Any], sines: Sequence[Any]) -> tuple[Any, 
 
 def rotation_gradient(rpy_rad: Array) -> Array:
     """Give dC/d(roll, pitch, yaw), (3, 3, 3): the first index is the angle; for one (3,) triple in rad."""
-    c = rotation(rpy_rad)
-    pitched = np.array([-np.sin(rpy_rad[2]), np.cos(rpy_rad[2]), 0.0])  # the axis of pitch, yawed
-    return np.stack([c @ _SPIN[0], skew(pitched) @ c, _SPIN[2] @ c])
+    c, gradient = rotation(rpy_rad), np.zeros((3, 3, 3))
+    cy, sy = math.cos(rpy_rad[2]), math.sin(rpy_rad[2])
+    gradient[0, :, 1], gradient[0, :, 2] = c[:, 2], -c[:, 1]  # C [x]×
+    gradient[1, 0], gradient[1, 1], gradient[1, 2] = cy * c[2], sy * c[2], -cy * c[0] - sy * c[1]
+    gradient[2, 0], gradient[2, 1] = -c[1], c[0]  # [z]× C, as that is about the axis of pitch, yawed
+    return gradient
 
 
 def roll_pitch_yaw(matrix: Array) -> Array:

@@ -46,11 +46,11 @@ class Running:
         pole, ground = (
             scatter_of([one.totals[kind] for one in used], kind, self._radius_m, sites) for kind in Kind
         )
-        bend = Form.of(pole, ground, np.ones(len(used), dtype=bool), result.weights).bend(result.vector)
-        self._closed = Subsets.near(pole, ground, result.weights, result.vector, self._free, bend=bend)
+        self._bend = Form.of(pole, ground, np.ones(len(used), dtype=bool), result.weights).bend(result.vector)
+        self._closed = Subsets.near(pole, ground, result.weights, result.vector, self._free)
         self._all, self._untold = self._closed, np.zeros((6, 6))
         if result.left_out:
-            left_out = self._closed.minima(~np.eye(len(used), dtype=bool))
+            left_out = self._closed.minima(~np.eye(len(used), dtype=bool), self._bend)
             self._untold = result.covariance - jackknife(left_out)[:6, :6]
 
     @one_thread
@@ -68,7 +68,7 @@ class Running:
             self._open[kind] = sum(blocks.values(), before)
         pole, ground = (scatter_of([self._open[kind]], kind, self._radius_m, [self._site]) for kind in Kind)
         self._all = self._closed.with_more(pole, ground)
-        (minimum,) = self._all.minima(np.ones((1, len(self._all)), dtype=bool))
+        (minimum,) = self._all.minima(np.ones((1, len(self._all)), dtype=bool), self._bend)
         return Now(Mount.from_vector(minimum[:6]), self._all.cost_m(minimum))
 
     @one_thread
@@ -76,7 +76,10 @@ class Running:
         """Give σ of what is free, from the scatter of all passes with the open one; of the rest as it was."""
         if not self._result.left_out:
             return self._result.sigma
-        told = self._untold + jackknife(self._all.minima(~np.eye(len(self._all), dtype=bool)))[:6, :6]
+        told = (
+            self._untold
+            + jackknife(self._all.minima(~np.eye(len(self._all), dtype=bool), self._bend))[:6, :6]
+        )
         variance = np.where(self._free[:6], np.diag(told), np.diag(self._result.covariance))
         sigma = np.sqrt(np.maximum(0.0, variance))
         return Mount(*sigma[:3].tolist(), *np.degrees(sigma[3:]).tolist())

@@ -136,16 +136,16 @@ class Scatter:
     def along(self, basis: Array, ratio: float) -> Along:
         """Give these sums along rows (A, 108, M) of A axes: all that is to be known of their mixtures."""
         there = np.ascontiguousarray(basis[:, self._features].swapaxes(0, 1))  # (K, A, M)
-        taken = self._within
+        within = taken = _squares(self._within, there)
         if self._aside is not None and np.isfinite(ratio):
-            taken = taken - self._aside
+            taken = within - _squares(self._aside, there)
         return Along(
             self.count,
             self.weight(ratio),
             self.sites,
             np.tensordot(self._mean, there, 1),
-            _squares(self._within, there),
-            _squares(taken, there),
+            within,
+            taken,
             (self._mean * np.tile(_RAY, 3)[self._features]) @ there[:, 0],
         )
 
@@ -636,9 +636,11 @@ def _cost7(q7: Array, turns: Array) -> Array:
 def _h(vector: Array) -> Array:
     """Give h⁺ (36,)."""
     time_s, range_m = vector[6:8]
-    columns = rotation(vector[3:6])[:, :2].T.ravel()
-    h = np.concatenate([columns, vector[:3], [1.0]])
-    return np.concatenate([h, range_m * columns, time_s * h, time_s**2 * h])
+    h = np.empty(WIDTH)
+    h[:6] = rotation(vector[3:6])[:, :2].T.ravel()
+    h[6:9], h[9] = vector[:3], 1.0
+    h[RANGE], h[TIME], h[TIME_SQUARED] = range_m * h[:6], time_s * h[BASE], time_s**2 * h[BASE]
+    return h
 
 
 def _h_base(vector: Array) -> Array:

@@ -33,8 +33,6 @@ class Subsets:
     weights: Weights
     vector: Array
     free: NDArray[np.bool_]
-    bend: Array
-    """(12, 12) `solve.Form.bend` of all of them."""
 
     @classmethod
     def near(
@@ -44,8 +42,6 @@ class Subsets:
         weights: Weights,
         vector: Array,
         free: NDArray[np.bool_],
-        *,
-        bend: Array,
     ) -> Subsets:
         """Look at passes from a vector."""
         rows = np.concatenate([[True], free])
@@ -55,7 +51,6 @@ class Subsets:
             weights,
             vector,
             free,
-            bend,
         )
 
     def __len__(self) -> int:
@@ -63,13 +58,13 @@ class Subsets:
 
     def with_more(self, pole: Scatter, ground: Scatter) -> Subsets:
         """Give these and more passes."""
-        more = Subsets.near(pole, ground, self.weights, self.vector, self.free, bend=self.bend)
+        more = Subsets.near(pole, ground, self.weights, self.vector, self.free)
         return replace(self, pole=self.pole.joined(more.pole), ground=self.ground.joined(more.ground))
 
-    def minima(self, subsets: NDArray[np.bool_]) -> Array:
-        """Give the minimum (B, 12) of each of B subsets (B, P)."""
+    def minima(self, subsets: NDArray[np.bool_], bend: Array) -> Array:
+        """Give the minimum (B, 12) of each of B subsets (B, P); ``bend`` (12, 12) is `solve.Form.bend`."""
         found = np.tile(self.vector, (len(subsets), 1))
-        found[:, self.free] += self._steps(subsets.astype(np.float64))
+        found[:, self.free] += self._steps(subsets.astype(np.float64), bend[np.ix_(self.free, self.free)])
         return found
 
     def cost_m(self, vector: Array) -> float:
@@ -107,9 +102,9 @@ class Subsets:
                 information = information - self.weights.rough_m2 * _outer(steeper)
         return (pole[:, :, 0], pole[:, :, 1:]), (gradient, information)
 
-    def _steps(self, subsets: Array) -> Array:
+    def _steps(self, subsets: Array, bend: Array) -> Array:
         """Give how far from the vector (B, M) the minima are: Levenberg-Marquardt, all at once."""
-        cost = _Cost(self.pole, self.ground, self.weights, subsets, self.bend[np.ix_(self.free, self.free)])
+        cost = _Cost(self.pole, self.ground, self.weights, subsets, bend)
         step = np.zeros((len(subsets), int(self.free.sum())))
         value, damping = cost.at(step), np.full(len(subsets), _DAMPING)
         for _ in range(_STEPS):

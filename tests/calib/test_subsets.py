@@ -52,7 +52,7 @@ def test_minima_of_subsets_are_those_of_their_own_forms(problem):
     left_out = ~np.eye(P, dtype=bool)
     halves = np.stack([rng.permutation(P) < P // 2 for _ in range(4)])
     subsets = np.concatenate([left_out, halves])
-    found = Subsets.near(pole, ground, weights, vector, free, bend=form.bend(vector)).minima(subsets)
+    found = Subsets.near(pole, ground, weights, vector, free).minima(subsets, form.bend(vector))
     exact = np.stack([solve.minimise(Form.of(pole, ground, some, weights), vector, held) for some in subsets])
     scatter = np.sqrt(P - 1) * exact[:P].std(axis=0)
     assert off_sigmas(found[:P], exact[:P], scatter).max() < 0.01
@@ -62,8 +62,8 @@ def test_minima_of_subsets_are_those_of_their_own_forms(problem):
 
 def test_the_minimum_of_all_stays_where_it_is(problem):
     pole, ground, weights, vector, _, free, form = problem
-    near = Subsets.near(pole, ground, weights, vector, free, bend=form.bend(vector))
-    (found,) = near.minima(np.ones((1, P), dtype=bool))
+    near = Subsets.near(pole, ground, weights, vector, free)
+    (found,) = near.minima(np.ones((1, P), dtype=bool), form.bend(vector))
     assert found == pytest.approx(vector, abs=1e-8)
     eq7 = Form.of(pole, ground, np.ones(P, dtype=bool))
     assert near.cost_m(found) == pytest.approx(solve.cost_m(eq7, vector), rel=1e-9)
@@ -89,11 +89,12 @@ def test_how_rows_bend_makes_half_the_hessian_whole(problem):
 
 def test_a_pass_that_comes_later_counts_as_if_it_had_been_there(problem, passes):
     *scatters, weights, vector, _, free, form = problem
-    whole = Subsets.near(*scatters, weights, vector, free, bend=form.bend(vector))
+    whole = Subsets.near(*scatters, weights, vector, free)
     early, late = (scatters_of(some) for some in (passes[:-1], passes[-1:]))
-    before = Subsets.near(*early, weights, vector, free, bend=form.bend(vector))
+    before = Subsets.near(*early, weights, vector, free)
     subsets = ~np.eye(P + 1, P, -1, dtype=bool)
-    assert before.with_more(*late).minima(subsets) == pytest.approx(whole.minima(subsets), abs=1e-9)
+    one, other = (of.minima(subsets, form.bend(vector)) for of in (before.with_more(*late), whole))
+    assert one == pytest.approx(other, abs=1e-9)
 
 
 def test_a_pass_without_ground_is_left_out_like_any_other(rig):
