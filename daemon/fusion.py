@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from polecal.calib import Kind, Mount, points_nav
 from polecal.calib.segment import RETRO_REFLECTIVE, Ground, Places, Reflector, reflectors
 from polecal.daemon.config import Config, Laser
-from polecal.daemon.passes import PassBuilder, StoredPass, observed
+from polecal.daemon.passes import OpenPass, PassBuilder, StoredPass, observed
 from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
 from polecal.drivers.errors import DeviceProtocolError
@@ -188,6 +188,11 @@ class LaserChannel:
         self._clock, self._revolutions = Clock(max_drift=_MIRROR_DRIFT), None
         self.dropped[NO_CLOCK] += sum(len(scan.range_m) for scan in self._waiting)
         self._waiting.clear()
+
+    @property
+    def open_passes(self) -> tuple[OpenPass, ...]:
+        """The passes that are not over."""
+        return self._builder.open_passes
 
     def end(self) -> list[StoredPass]:
         """Place what can be placed and close what is open, at the end of a run."""

@@ -63,8 +63,11 @@ class StoredPass:
         return Kept(self.place, self.t_ns, self.moments, self.facts, self.quality)
 
 
-@dataclass(slots=True)
-class _Open:
+@dataclass(slots=True, eq=False)
+class OpenPass:
+    """A pass that is not over: host times, and GPS times and returns of its scans, some at a time."""
+
+    place: int
     first_ns: int
     last_ns: int
     parts: list[tuple[NDArray[np.int64], Returns]]
@@ -79,7 +82,7 @@ class PassBuilder:
         self.uneven = 0
         """Ground returns left out, as they stood out of the ground."""
         self._slice_deg = slice_deg
-        self._open: dict[int, _Open] = {}
+        self._open: dict[int, OpenPass] = {}
         self._site, self._count = site, count
 
     def add(
@@ -93,7 +96,7 @@ class PassBuilder:
 
         ``t_ns`` is the host time of the first and of the last of these scans.
         """
-        current = self._open.setdefault(place, _Open(*t_ns, []))
+        current = self._open.setdefault(place, OpenPass(place, *t_ns, []))
         current.last_ns = t_ns[1]
         current.parts.append((gps_ns, returns))
 
@@ -118,7 +121,7 @@ class PassBuilder:
                 self.too_short += 1
                 continue
             self._count += 1
-            kept = _even(returns, mount)
+            kept = even(returns, mount)
             self.uneven += int(np.count_nonzero(~kept))
             if not kept.all():
                 gps_ns, returns = gps_ns[kept], returns[kept]
@@ -137,12 +140,18 @@ class PassBuilder:
             )
         return closed
 
+    @property
+    def open_passes(self) -> tuple[OpenPass, ...]:
+        """The passes that are not over, one a place."""
+        return tuple(self._open.values())
+
     def counts(self) -> tuple[int, int]:
         """Give how many passes are open, and how many returns they hold."""
         return len(self._open), sum(len(part[1]) for one in self._open.values() for part in one.parts)
 
 
-def _even(returns: Returns, mount: Mount) -> NDArray[np.bool_]:
+def even(returns: Returns, mount: Mount) -> NDArray[np.bool_]:
+    """Say which returns (N,) are the pole's, or of ground that nothing stands on, as ``mount`` has it."""
     kept = np.ones(len(returns), dtype=bool)
     ground = np.flatnonzero(returns.kind == Kind.GROUND)
     down_m = points_nav(returns, mount)[ground, 2]

@@ -26,6 +26,7 @@ from polecal.daemon.control import Code, Refused
 from polecal.daemon.fusion import LaserChannel
 from polecal.daemon.navigation import Navigation, OnPose, name_of
 from polecal.daemon.passes import Kept, StoredPass
+from polecal.daemon.passing import Passing
 from polecal.daemon.past import Past
 from polecal.daemon.pulse import Pulse
 from polecal.daemon.route import LaserStand, Place, Stand
@@ -66,6 +67,7 @@ class _LaserRun:
         """All that were closed, in their order, of the pole or of another reflector."""
         self.dropped: dict[int, Choice] = {}
         """Passes that the operator does not want, by id."""
+        self._passing, self._calibrated = Passing(), list[Pass]()
         self._config, self._laser = config, laser
         self._earlier_poles: set[tuple[int, int]] = set()
         self.anew(0, trajectory, gps_clock)
@@ -99,6 +101,7 @@ class _LaserRun:
         poles = self.poles()
         kept = [one for one in self.passes if one.where in poles and one.id not in self.dropped]
         passes = [one.moments for one in kept]
+        self._calibrated = passes
         self.alone = self.result = self.view = None
         self.channel.mount = self.setup.measured
         if not passes:
@@ -111,6 +114,14 @@ class _LaserRun:
             # One pass over level ground may put the laser anywhere; what is placed by that is lost.
             if self._could_be(self.result.mount):
                 self.channel.mount = self.result.mount
+
+    def passing(self) -> dict[str, Any] | None:
+        """Tell of the pass of the pole that is being driven, None where there is none."""
+        if self.result is None:
+            return None
+        places = {place for site, place in self.poles() if site == self._site}
+        of_pole = [one for one in self.channel.open_passes if one.place in places]
+        return self._passing.told(self._calibrated, self.setup, self.result, of_pole, self.channel.mount)
 
     def reflectors(self) -> dict[tuple[int, int], list[Kept]]:
         """Give the passes of each reflector that could be the pole, by (site, place)."""
@@ -282,11 +293,14 @@ class Pipeline:
         state = State.REJECTED if reasons else State.ACCEPTED
         self.routine.to(state, t_ns, "; ".join(reasons) or "all criteria are met")
 
-    def status(self) -> dict[str, Any]:
-        """Give the part of STATUS that follows from the data."""
+    def status(self, *, passing: bool = True) -> dict[str, Any]:
+        """Give the part of STATUS that follows from the data; of a pass that is not over if ``passing``."""
+        told = [{"passing": laser.passing()} if passing else {} for laser in self._lasers.values()]
         return {
             "state": str(self.routine.state),
-            "lasers": [self._entry(laser) for laser in self._lasers.values()],
+            "lasers": [
+                self._entry(laser) | more for laser, more in zip(self._lasers.values(), told, strict=True)
+            ],
             "next": self._next(),
             "notes": self._notes(),
         }

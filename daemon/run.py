@@ -210,11 +210,14 @@ class Run:
                 return answer.result(_LOOK_S)
         return answer.result() if answer.done() else None
 
-    def status(self) -> dict[str, Any]:
-        """Give the parts of STATUS that a run knows; while it calculates, those from before."""
+    def status(self, *, passing: bool = True) -> dict[str, Any]:
+        """Give the parts of STATUS that a run knows; while it calculates, those from before.
+
+        What a pass says that is not over takes some ms a second of it: it is told if ``passing``.
+        """
         if self._lock.acquire(timeout=_PATIENCE_S):
             try:
-                self._known = self._know()
+                self._known = self._know(passing=passing)
             finally:
                 self._lock.release()
         status, since_ns, heard = self._known
@@ -241,10 +244,10 @@ class Run:
             notes.append(f"for want of room not written: {', '.join(names)}; they are once there is room")
         return notes
 
-    def _know(self) -> tuple[dict[str, Any], int, dict[str, dict[str, Any]]]:
+    def _know(self, *, passing: bool = False) -> tuple[dict[str, Any], int, dict[str, dict[str, Any]]]:
         """Give what the pipeline says: its status, since when it is in its state, and of each device."""
         heard = {device.name: self._pipeline.device(device.name) for device in self._devices}
-        return self._pipeline.status(), self._pipeline.routine.since_ns, heard
+        return self._pipeline.status(passing=passing), self._pipeline.routine.since_ns, heard
 
     def beats(self) -> dict[str, float]:
         """Give for each thread when it last showed that it is not stuck; of those that are done, nothing."""

@@ -35,6 +35,7 @@ _PACE_SLICES = 3  # done, before a pace can be told
 _LONG_S, _SOON_S = 10 * 3600, 1800  # of disk left: no need to tell, and need to shout
 _BARS = "▁▂▃▄▅▆▇█"
 _SPARKS = 24
+_NOW = " now {:>5}"
 _PROBLEM_LINES = 2  # of a device's problem, and again of its hint
 _LEAST_TALK = 3  # lines for verdict and notes; where a rose leaves fewer, there is none
 _ASCII = str.maketrans("✓✗·●○—▶→…°–×─−±σ²≤≥" + _BARS, "+x.*o->>~d-x--~s2<>" + "_.-=+*#@") | {ord("√"): None}
@@ -256,8 +257,11 @@ def _costs(laser: Mapping[str, Any]) -> list[Text]:
     line = Text("cost  ").append(f"{_number(now, 3):>8}", style="bold").append(" m")
     line.append(f"   by hand {_number(hand, 3)} m", style="dim")
     lines = [line]
-    if spark := _spark(_list(laser.get("costs_m")), _SPARKS):
+    passing = _dict(laser.get("passing"))
+    if spark := _spark(_list(laser.get("costs_m")), _SPARKS - len(_NOW) * bool(passing)):
         lines.append(Text("√c    ").append(spark, style="cyan"))
+        if passing:
+            lines[-1].append(_NOW.format(_number(passing.get("cost_m"), 3)), style="bold cyan")
     gain = laser.get("improvement")
     if isinstance(gain, int | float):
         lines.append(Text(f"      improving by {100 * gain:.1f} %", style="dim"))

@@ -187,10 +187,10 @@ class Service:
         run.stop("not all devices stream", problem=problem)
         raise problem
 
-    def status(self) -> dict[str, Any]:
-        """Give what STATUS is answered."""
+    def status(self, *, passing: bool = True) -> dict[str, Any]:
+        """Give what STATUS is answered; of a pass that is not over only if ``passing``."""
         if self._run is not None:
-            return {"class": "STATUS"} | self._run.status()
+            return {"class": "STATUS"} | self._run.status(passing=passing)
         devices = [
             {"name": laser.name, "kind": "sick_lms", "port": laser.port, "state": "closed"}
             for laser in self._config.lasers
@@ -354,7 +354,7 @@ def _attend(service: Service, manager: Manager, signals: queue.SimpleQueue[int],
     refused = ""
     while True:
         manager.alive(service.beats())
-        manager.status(summary(service.status()) + refused)
+        manager.status(summary(service.status(passing=False)) + refused)
         try:
             number = signals.get(timeout=every_s)
         except queue.Empty:

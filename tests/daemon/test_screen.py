@@ -292,6 +292,9 @@ SCENES = {
         disk=OK_DISK,
     ),
     "collecting late": status(LATE, run_s=121.0, disk={"free_mb": 500, "left_s": 5400}),
+    "collecting, passing": status(
+        LATE | {"passing": {"pole_returns": 134, "estimate": {}, "sigma": {}, "cost_m": 0.0347}}
+    ),
     "collecting, passes missing": status(
         LATE
         | {"need": NEED | {"min_passes": 3}}
