@@ -46,7 +46,7 @@ WAYS = {
     "the six": Setup(HAND, pole_radius_m=RIG.pole_radius_m, extras=frozenset(), criteria=LOOSE),
     "all extras": Setup(HAND, pole_radius_m=RIG.pole_radius_m, criteria=LOOSE),
 }
-WAYS |= {f"{name}, by kind": replace(setup, by_kind=True) for name, setup in WAYS.items()}
+WAYS |= {f"{name}, kinds as in Eq. 7": replace(setup, by_kind=False) for name, setup in WAYS.items()}
 TARGETS = (5.0, 5.0, np.inf, 0.02, 0.02, 0.03)  # mm and °
 
 
