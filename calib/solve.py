@@ -303,12 +303,10 @@ class Weights:
         north_east, down = pole_rows(about), ground_rows(about)
         ground_m2 = ground.mean_within(down, used)
         ratios = (pole.ratio(north_east, used), ground.ratio(down, used)) if pass_error else (np.inf, np.inf)
-        if not by_kind:
-            return cls(*ratios, rough_m2=ground_m2 * rough)
-        pole_m2 = max(pole.mean_within(north_east, used), _LEAST_M2)
+        pole_m2 = pole.mean_within(north_east, used)
         return cls(
             *ratios,
-            pole_m2 / max(ground_m2, _LEAST_M2),
+            max(pole_m2, _LEAST_M2) / max(ground_m2, _LEAST_M2) if by_kind else None,
             ground_m2 if rough and ground_m2 > _LEAST_M2 else 0.0,
         )
 
@@ -338,8 +336,9 @@ class Form:
     steeply than the true one. In words of likelihood: the density of what is measured, the range, is that of
     the height times d, and Eq. 6 leaves out the factor. As d is the sensor's height over the ground by the
     range, the missing term is -2 σ² ln of that height but for what no mount changes. And σ² itself is only
-    told by the same returns: with ``bumps``, Eq. 6 / σ² within the passes becomes its logarithm, else
-    what the first solution took the roughness for would hold the beams to the slant of that solution.
+    told by the same returns: with ``bumps``, Eq. 6 / σ² within the passes becomes its logarithm. Taken as
+    known, what a first solution took the roughness for would hold the beams to the slant of that solution:
+    to that of Eq. 6, by a degree or more where the ground has waves.
     """
     ray: Array | None = None
     """(108,) `Scatter.ray` of the ground, where it is rough."""
@@ -356,7 +355,7 @@ class Form:
             ground.form(used, weights.ground_ratio),
             weights.rough_m2,
             ground.ray(used) if weights.rough_m2 else None,
-            ground.within_form(used) if weights.rough_m2 and weights.ground_return else None,
+            ground.within_form(used) if weights.rough_m2 else None,
             weights.balance(pole.count[used].sum(), ground.count[used].sum()),
         )
 

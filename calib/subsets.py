@@ -93,13 +93,10 @@ class Subsets:
             ray = count @ self.ground.ray
             steeper = ray[:, 1:] / ray[:, :1]
             gradient = gradient - self.weights.rough_m2 * steeper
-            if self.weights.ground_return is not None:
-                bumps = _mixed(parts, self.ground.within) / np.maximum(1.0, count.sum(axis=1))[:, None, None]
-                less = (
-                    self.weights.rough_m2 / np.maximum(bumps[:, :1, 0], _LEAST * self.weights.rough_m2) - 1.0
-                )
-                gradient = gradient + less * bumps[:, 1:, 0]
-                information = information - self.weights.rough_m2 * _outer(steeper)
+            bumps = _mixed(parts, self.ground.within) / np.maximum(1.0, count.sum(axis=1))[:, None, None]
+            less = self.weights.rough_m2 / np.maximum(bumps[:, :1, 0], _LEAST * self.weights.rough_m2) - 1.0
+            gradient = gradient + less * bumps[:, 1:, 0]
+            information = information - self.weights.rough_m2 * _outer(steeper)
         return (pole[:, :, 0], pole[:, :, 1:]), (gradient, information)
 
     def _steps(self, subsets: Array, bend: Array) -> Array:
@@ -148,7 +145,7 @@ class _Cost:
         self._balance = np.array([weights.balance(*each) for each in zip(on_pole, on_ground, strict=True)])
         self._square = _form(pole, subsets) + self._balance[:, None, None] * _form(ground, subsets)
         self._square[:, 1:, 1:] += bend
-        self._rough_m2, self._profiled = weights.rough_m2, weights.ground_return is not None
+        self._rough_m2 = weights.rough_m2
         per_return = 1.0 / np.maximum(1.0, on_ground)[:, None]
         self._ray = (subsets * ground.count) @ ground.ray * per_return
         self._bumps = _mixed(subsets, ground.within) * per_return[:, :, None]
@@ -159,9 +156,8 @@ class _Cost:
         value: Array = _dot(row, _times(self._square, row))
         if self._rough_m2:
             rough = -2.0 * np.log(np.maximum(np.abs(_dot(self._ray, row)), _LEAST))
-            if self._profiled:
-                bumps = _dot(row, _times(self._bumps, row)) / self._rough_m2
-                rough += np.log(np.maximum(bumps, _LEAST)) + 1.0 - bumps
+            bumps = _dot(row, _times(self._bumps, row)) / self._rough_m2
+            rough += np.log(np.maximum(bumps, _LEAST)) + 1.0 - bumps
             value = value + self._balance * self._rough_m2 * rough
         return value
 
@@ -175,12 +171,11 @@ class _Cost:
         steeper = self._ray[:, 1:] / _dot(self._ray, row)[:, None]
         gradient = gradient - rough * steeper
         hessian += rough[:, :, None] * _outer(steeper)
-        if self._profiled:
-            pulled = _times(self._bumps, row)
-            bumps = np.maximum(_dot(row, pulled) / self._rough_m2, _LEAST)[:, None]
-            less, way = self._balance[:, None] * (1.0 / bumps - 1.0), pulled[:, 1:] / (bumps * self._rough_m2)
-            gradient = gradient + less * pulled[:, 1:]
-            hessian += less[:, :, None] * self._bumps[:, 1:, 1:] - 2.0 * rough[:, :, None] * _outer(way)
+        pulled = _times(self._bumps, row)
+        bumps = np.maximum(_dot(row, pulled) / self._rough_m2, _LEAST)[:, None]
+        less, way = self._balance[:, None] * (1.0 / bumps - 1.0), pulled[:, 1:] / (bumps * self._rough_m2)
+        gradient = gradient + less * pulled[:, 1:]
+        hessian += less[:, :, None] * self._bumps[:, 1:, 1:] - 2.0 * rough[:, :, None] * _outer(way)
         return gradient, hessian
 
 

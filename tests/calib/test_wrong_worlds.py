@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from polecal.calib import Kind, Mount, Need, Result, Returns, Setup, estimate
+from polecal.calib import Kind, Mount, Need, Result, Returns, Setup, estimate, points_nav
 from polecal.calib.estimate import passes_of
 from polecal.calib.geometry import Array, roll_pitch_yaw, rotation, wrap
 from polecal.calib.observations import PARAMETERS
@@ -128,6 +128,27 @@ def tape_short(rng: np.random.Generator) -> Returns:
     return replace(returns, range_m=returns.range_m + np.where(returns.kind == Kind.POLE, off, 0.0))
 
 
+def ground_has_waves(rng: np.random.Generator) -> Returns:
+    """The same ones for all passes, half a metre to 10 m long; at one speed, with stamps that are late."""
+    returns = late_at_one_speed(rng)
+    ground = returns.kind == Kind.GROUND
+    points, origin = (points_nav(replace(returns, range_m=r), TRUE) for r in (returns.range_m, 0 * ground))
+    down = (points - origin)[ground, 2] / returns.range_m[ground]
+    way, begins = rng.uniform(0, 2 * np.pi, (2, 24))
+    per_m = 2 * np.pi / rng.uniform(*rng.choice([[0.5, 2.0], [2.0, 10.0]]), 24)
+    waves = points[ground, :2] @ (per_m * [np.cos(way), np.sin(way)]) + begins
+    height_m = rng.uniform(0.005, 0.05) * np.sin(waves).sum(axis=1) / np.sqrt(12)
+    range_m = returns.range_m.copy()
+    range_m[ground] -= height_m / down
+    return replace(returns, range_m=range_m)
+
+
+def tilt_badly_known(rng: np.random.Generator) -> Returns:
+    """Roll and pitch of the vehicle are off by up to 0.3° in each pass, σ."""
+    sigma_deg = rng.uniform(0.03, 0.3)
+    return driven(rng, rpy_sigma_deg=(sigma_deg, sigma_deg, 0.04))
+
+
 def joined(*parts: Returns) -> Returns:
     names = [name for name in Returns.__slots__ if getattr(parts[0], name) is not None]
     return Returns(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -144,6 +165,8 @@ WORLDS: list[World] = [
     position_drifts,
     yaw_drifts,
     tape_short,
+    ground_has_waves,
+    tilt_badly_known,
 ]
 
 
