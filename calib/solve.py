@@ -41,6 +41,7 @@ _STEP = 1e-5
 _DESCENTS = 40
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
 _LEAST_ROUGH = 1e-6  # of the ground's variance
+_MOST_ROUGH = 4.0  # the same
 _LEAST_M2 = 1e-6  # of a return's own variance: no laser is as good as 1 mm
 
 
@@ -336,7 +337,7 @@ class Form:
     steeply than the true one. In words of likelihood: the density of what is measured, the range, is that of
     the height times d, and Eq. 6 leaves out the factor. As d is the sensor's height over the ground by the
     range, the missing term is -2 σ² ln of that height but for what no mount changes. And σ² itself is only
-    told by the same returns: with ``bumps``, Eq. 6 / σ² within the passes becomes its logarithm. Taken as
+    told by the same returns: with ``bumps``, Eq. 6 / σ² within the passes becomes its `roughness`. Taken as
     known, what a first solution took the roughness for would hold the beams to the slant of that solution:
     to that of Eq. 6, by a degree or more where the ground has waves.
     """
@@ -374,9 +375,9 @@ class Form:
             grazed = 2.0 * np.log(max(float(abs(down @ self.ray)), _LEAST_HEIGHT_M))
             return self.spread(vector) - self.balance * self.rough_m2 * float(grazed)
         bumps_m2 = float(down @ self.bumps @ down)
-        rough = bumps_m2 / self.rough_m2
         height_m = float(abs(down @ self.ray))
-        grazed = np.log(max(rough, _LEAST_ROUGH)) + 1.0 - 2.0 * np.log(max(height_m, _LEAST_HEIGHT_M))
+        rough, _ = roughness(np.array(bumps_m2 / self.rough_m2))
+        grazed = float(rough) + 1.0 - 2.0 * np.log(max(height_m, _LEAST_HEIGHT_M))
         return self.spread(vector) + self.balance * float(self.rough_m2 * grazed - bumps_m2)
 
     def slope(self, vector: Array) -> tuple[Array, Array]:
@@ -393,7 +394,7 @@ class Form:
             down = ground_rows(vector)[0]
             weights = _ground_weights(vector)
             bumps = _half_slope(self.bumps, *weights, h, _h_gradient(vector, h))
-            less = 1.0 / max(float(down @ self.bumps @ down) / self.rough_m2, _LEAST_ROUGH) - 1.0
+            less = float(roughness(down @ self.bumps @ down / self.rough_m2)[1]) - 1.0
             gradient = gradient + less * bumps[0]
             hessian = hessian + less * bumps[1] - self.rough_m2 * np.outer(steeper, steeper)
         return pole[0] + self.balance * gradient, pole[1] + self.balance * hessian
@@ -404,11 +405,10 @@ class Form:
         How steeply the beams meet rough ground is not told by how rough it looks.
         """
         pole, ground, steeper = self._half_slopes(vector)
-        told = (
-            ground[1]
-            if steeper is None or self.bumps is None
-            else ground[1] - self.rough_m2 * np.outer(steeper, steeper)
-        )
+        told = ground[1]
+        if steeper is not None and self.bumps is not None:
+            down = ground_rows(vector)[0]
+            told = told - min(self.rough_m2, float(down @ self.bumps @ down)) * np.outer(steeper, steeper)
         return pole[1] + self.balance * told
 
     def of_known_roughness(self, vector: Array) -> Form:
@@ -419,7 +419,7 @@ class Form:
         if self.bumps is None:
             return self
         down = ground_rows(vector)[0]
-        less = self.rough_m2 / max(float(down @ self.bumps @ down), _LEAST_ROUGH * self.rough_m2) - 1.0
+        less = float(roughness(down @ self.bumps @ down / self.rough_m2)[1]) - 1.0
         return replace(self, ground=self.ground + less * self.bumps, bumps=None)
 
     def in_h(self, vector: Array) -> Array:
@@ -456,7 +456,7 @@ class Form:
             pull = pull - self.rough_m2 * self.ray / (self.ray @ down)
         if self.bumps is not None:
             bumps = self.bumps @ down
-            pull = pull + (self.rough_m2 / max(float(down @ bumps), 1e-300) - 1.0) * bumps
+            pull = pull + (float(roughness(down @ bumps / self.rough_m2)[1]) - 1.0) * bumps
         pulls = [self.pole @ row for row in pole_rows(vector)] + [self.balance * pull]
         every = (
             np.concatenate(of) for of in zip(_pole_weights(vector), _ground_weights(vector), strict=True)
@@ -479,6 +479,16 @@ class Form:
             steeper = self.ray @ down / (_rows(weights, h)[0] @ self.ray)
         pole = _half_slope(self.pole, *_pole_weights(vector), h, dh)
         return pole, _half_slope(self.ground, weights, dweights, h, dh), steeper
+
+
+def roughness(rough: Array) -> tuple[Array, Array]:
+    """Give ln of how much rougher ground looks than it was taken for, and its derivative, each shaped alike.
+
+    From four times as rough on the logarithm goes on straight: else it would hardly mind a mount that tilts
+    all of the ground.
+    """
+    near = np.clip(rough, _LEAST_ROUGH, _MOST_ROUGH)
+    return np.log(near) + np.maximum(rough - _MOST_ROUGH, 0.0) / _MOST_ROUGH, 1.0 / near
 
 
 def _jacobian(weight: Array, dweight: Array, h: Array, dh: Array) -> Array:

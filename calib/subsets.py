@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polecal.calib.geometry import Array
-from polecal.calib.solve import Along, Scatter, Weights, ground_basis, pole_basis
+from polecal.calib.solve import Along, Scatter, Weights, ground_basis, pole_basis, roughness
 
 _STEPS = 30
 _DAMPING, _EASED, _STIFFER, _GIVE_UP = 1e-12, 0.1, 100.0, 1e6
 _NOTHING = 1e-12
-_LEAST = 1e-6  # of a height in m, and of a ground's roughness against the one it was taken for
+_LEAST = 1e-6  # of a height in m
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +94,11 @@ class Subsets:
             steeper = ray[:, 1:] / ray[:, :1]
             gradient = gradient - self.weights.rough_m2 * steeper
             bumps = _mixed(parts, self.ground.within) / np.maximum(1.0, count.sum(axis=1))[:, None, None]
-            less = self.weights.rough_m2 / np.maximum(bumps[:, :1, 0], _LEAST * self.weights.rough_m2) - 1.0
+            rough_m2 = bumps[:, :1, 0]
+            less = roughness(rough_m2 / self.weights.rough_m2)[1] - 1.0
             gradient = gradient + less * bumps[:, 1:, 0]
-            information = information - self.weights.rough_m2 * _outer(steeper)
+            known_m2 = np.minimum(rough_m2, self.weights.rough_m2)
+            information = information - known_m2[:, :, None] * _outer(steeper)
         return (pole[:, :, 0], pole[:, :, 1:]), (gradient, information)
 
     def _steps(self, subsets: Array, bend: Array) -> Array:
@@ -157,7 +159,7 @@ class _Cost:
         if self._rough_m2:
             rough = -2.0 * np.log(np.maximum(np.abs(_dot(self._ray, row)), _LEAST))
             bumps = _dot(row, _times(self._bumps, row)) / self._rough_m2
-            rough += np.log(np.maximum(bumps, _LEAST)) + 1.0 - bumps
+            rough += roughness(bumps)[0] + 1.0 - bumps
             value = value + self._balance * self._rough_m2 * rough
         return value
 
@@ -172,10 +174,12 @@ class _Cost:
         gradient = gradient - rough * steeper
         hessian += rough[:, :, None] * _outer(steeper)
         pulled = _times(self._bumps, row)
-        bumps = np.maximum(_dot(row, pulled) / self._rough_m2, _LEAST)[:, None]
-        less, way = self._balance[:, None] * (1.0 / bumps - 1.0), pulled[:, 1:] / (bumps * self._rough_m2)
+        bumps = (_dot(row, pulled) / self._rough_m2)[:, None]
+        per = roughness(bumps)[1]
+        less, way = self._balance[:, None] * (per - 1.0), per * pulled[:, 1:] / self._rough_m2
         gradient = gradient + less * pulled[:, 1:]
-        hessian += less[:, :, None] * self._bumps[:, 1:, 1:] - 2.0 * rough[:, :, None] * _outer(way)
+        bent = 2.0 * rough * (per * bumps < 1.0 + 1e-9)  # beyond, `roughness` is straight
+        hessian += less[:, :, None] * self._bumps[:, 1:, 1:] - bent[:, :, None] * _outer(way)
         return gradient, hessian
 
 

@@ -48,7 +48,7 @@ def test_passes_left_out_cost_what_the_cloud_says(rig):
     """By hand: each pass's returns at the mount found without it, about the others' mean there."""
     returns = rig.drive(noise_m=0.01, nav_m=0.02, passes=8, seed=2)
     passes = passes_of(returns, 30)
-    setup = Setup(rig.measured, pass_error=False, extras=frozenset())
+    setup = Setup(rig.measured, pass_error=False, rough_ground=False, extras=frozenset())
     whole = estimate(passes, setup)
     squares = {kind: 0.0 for kind in Kind}
     for one in passes:

@@ -4,7 +4,7 @@ import pytest
 from polecal.calib.estimate import passes_of, scatter_of
 from polecal.calib.geometry import wrap
 from polecal.calib.observations import Kind
-from polecal.calib.solve import EXTRAS, Form, minimise, minimise_globally
+from polecal.calib.solve import EXTRAS, Form, minimise, minimise_globally, roughness
 
 EVERY = np.ones(12, dtype=bool)
 ROUGH_M2 = 0.03**2
@@ -36,6 +36,16 @@ def test_slope_is_half_the_costs_derivative_where_roughness_is_not_known_and_kin
     steps = 1e-6 * np.eye(12)
     differences = [(unknown.cost(start + step) - unknown.cost(start - step)) / 4e-6 for step in steps]
     assert unknown.slope(start)[0] == pytest.approx(np.array(differences), rel=1e-5, abs=1e-7)
+
+
+def test_ground_that_looks_ever_rougher_costs_ever_more():
+    """Past four times as rough no longer by the logarithm, but as steeply as there."""
+    rough = np.array([0.5, 1.0, 3.9, 4.1, 100.0])
+    value, slope = roughness(rough)
+    step = 1e-7
+    assert slope == pytest.approx((roughness(rough + step)[0] - roughness(rough - step)[0]) / (2 * step))
+    assert value[1] == 0.0
+    assert value[4] > 20
 
 
 def test_how_rough_unknown_ground_was_taken_for_does_not_move_its_minimum(form, start):
