@@ -109,6 +109,15 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True)
+class Shared:
+    """Which laser helped (`shared`), in how many passes of both, and which part of its σ alone is left."""
+
+    laser: str
+    passes: int
+    sigma_ratio: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
 class Result:
     """A mount, and how far to trust it.
 
@@ -144,6 +153,8 @@ class Result:
     """What the used passes and kinds counted."""
     certificate: Certificate | None = None
     """Whether the cost is proven to be the lowest; None where only the next minimum was sought."""
+    shared: Shared | None = None
+    """What another laser's view of the same passes has added to mount and σ; ``left_out`` is without."""
 
     @property
     def vector(self) -> Array:

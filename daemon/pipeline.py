@@ -18,6 +18,7 @@ from polecal.calib import CalibrationError, Mount, Pass, Result, Verdict, estima
 from polecal.calib.agreement import View, disagreements
 from polecal.calib.coverage import headings
 from polecal.calib.geometry import wrap
+from polecal.calib.shared import Witness, share
 from polecal.daemon import results, rows
 from polecal.daemon.choices import Choice, meant, parse_name
 from polecal.daemon.choices import name_of as pass_name
@@ -60,8 +61,9 @@ class _LaserRun:
         self._on_scan = partial(on_scan, laser.name) if on_scan is not None else None
         self.result: Result | None = None
         self.alone: Result | None = None
-        """The same, before it is compared with what other lasers say."""
+        """The same, before it is compared with what other lasers say, and helped by it."""
         self.view: View | None = None
+        self.witness: Witness | None = None
         self.costs_m: deque[float] = deque(maxlen=_COSTS)
         self.passes: list[Kept] = []
         """All that were closed, in their order, of the pole or of another reflector."""
@@ -102,7 +104,7 @@ class _LaserRun:
         kept = [one for one in self.passes if one.where in poles and one.id not in self.dropped]
         passes = [one.moments for one in kept]
         self._calibrated = passes
-        self.alone = self.result = self.view = None
+        self.alone = self.result = self.view = self.witness = None
         self.channel.mount = self.setup.measured
         if not passes:
             return  # what was thin from one side has turned out to be a plate, or all were dropped
@@ -111,6 +113,7 @@ class _LaserRun:
             if len(self._config.lasers) > 1:
                 spans_ns = [one.facts.gps_ns for one in kept]
                 self.view = View.of(self.name, passes, spans_ns, self.setup, self.result)
+                self.witness = Witness(self.name, passes, spans_ns, self.setup, self.result)
             # One pass over level ground may put the laser anywhere; what is placed by that is lost.
             if self._could_be(self.result.mount):
                 self.channel.mount = self.result.mount
@@ -480,7 +483,7 @@ class Pipeline:
         laser.take(stored)
 
     def _compare(self) -> tuple[str, ...]:
-        """Accept no laser where two of them cannot both be right; say which."""
+        """Accept no laser where two of them cannot both be right, and say which; else they help others."""
         apart = disagreements([laser.view for laser in self._lasers.values() if laser.view is not None])
         enough = all(laser.alone and laser.alone.verdict.accepted for laser in self._lasers.values())
         for laser in self._lasers.values():
@@ -489,6 +492,10 @@ class Pipeline:
                 verdict = laser.alone.verdict
                 refused = Verdict(False, (*verdict.reasons, *apart), enough or verdict.hopeless)
                 laser.result = replace(laser.alone, verdict=refused)
+        if not apart:
+            witnesses = [laser.witness for laser in self._lasers.values() if laser.witness is not None]
+            for name, result in share(witnesses).items():
+                self._lasers[name].result = result
         return apart
 
     def _conclude(self, t_ns: int) -> None:

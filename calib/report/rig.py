@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,24 @@ def drive(rig: Rig, rng: np.random.Generator, pole_returns: int, ground_returns:
         scans.acceleration_mps2[scan],
         scans.angular_acceleration_radps2[scan],
     )
+
+
+def drives(
+    rig: Rig, mounts: Sequence[Mount], seed: int, pole_returns: int, ground_returns: int
+) -> list[Returns]:
+    """Give what `drive` does, of several lasers on one vehicle: one path, the same navigation errors."""
+    rng = np.random.default_rng((seed, 1))
+    off_m = np.array(rig.position_sigma_m) * rng.normal(size=(rig.passes, 3))
+    off_rad = np.radians(rig.rpy_sigma_deg) * rng.normal(size=(rig.passes, 3))
+    exact = replace(rig, position_sigma_m=(0.0, 0.0, 0.0), rpy_sigma_deg=(0.0, 0.0, 0.0))
+    seen = []
+    for mount in mounts:
+        rng = np.random.default_rng(seed)  # which draws the path first
+        returns = drive(replace(exact, mount=mount), rng, pole_returns, ground_returns)
+        number = returns.pass_id
+        position_m, rpy_rad = returns.position_m + off_m[number], returns.rpy_rad + off_rad[number]
+        seen.append(replace(returns, position_m=position_m, rpy_rad=rpy_rad))
+    return seen
 
 
 def _scans(rig: Rig, rng: np.random.Generator) -> _Scans:

@@ -166,6 +166,24 @@ def test_two_lasers_of_which_one_is_held_where_it_is_not_are_both_rejected_and_w
     assert played.transitions[-1][3].count("front and copy disagree") == 1
 
 
+def test_a_laser_that_saw_some_of_the_passes_learns_from_one_that_saw_all(begun, settings, drive, t0_ns):
+    heard = [chunk for device, t_ns, data in drive.chunks for chunk in _twice(device, t_ns, data)]
+    front = settings().lasers[0].model_dump()
+    lasers = [front, front | {"name": "copy", "port": "/dev/lms-copy"}]
+    all_of_it = begun(settings(lasers=lasers)).feed(heard).finish().pipeline.past()
+    some = [one for one in all_of_it.passes["copy"] if one.id % 3]
+    past = replace(all_of_it, passes=all_of_it.passes | {"copy": some})
+    undemanding = {"cost_m": 1.0, "left_out_m": 1.0, "improvement": 0.9, "doubling": 0.9}
+    pipeline = begun(settings(lasers=lasers, accept=undemanding, routine={"slices_needed": 1})).pipeline
+    pipeline.reopen(past, t0_ns)
+    whole, part = (pipeline.status()["lasers"][index] for index in range(2))
+    assert whole["shared"] is None
+    assert part["shared"]["laser"] == "front"
+    assert part["shared"]["passes"] == part["passes"] >= 8
+    for key in ("x_m", "y_m"):
+        assert part["estimate"][key] == pytest.approx(whole["estimate"][key], abs=2e-3), "and so is the same"
+
+
 def _twice(device, t_ns, data):
     return [(name, t_ns, data) for name in (("front", "copy") if device == "front" else (device,))]
 
