@@ -38,6 +38,7 @@ _REVOLUTION_NS = round(REVOLUTION_S * 1e9)
 _MIRROR_DRIFT = 5e-3  # a motor, not a crystal: 75 Hz is 13.33 ms, the sheet's 148 µs word says 13.32 ms
 _SILENCE_NS = 2_000_000_000  # after which it may have been switched off, and count from anywhere
 _EARLY_SCANS = 0.1  # by which a clock that is still being learnt may put a scan too late
+_GROUND_DEG = 1.0  # beams side by side meet the same bumps: of four, one makes σ what all four do, to 2 %
 _TOGETHER_NS = 1_000_000_000  # a second's scans are placed at once: one by one it takes four times as long
 _MOST_WAITING = 256  # scans that wait for their poses: 14 s at 18.8 Hz
 _SLOWEST_MPS, _SLOWEST_RADPS = 0.05, 0.02  # a vehicle that stands adds weight and no information
@@ -100,6 +101,7 @@ class LaserChannel:
         self._on_frame, self._on_scan = on_frame, on_scan
         count = round(laser.fov_deg / laser.resolution_deg) + 1
         self._bearing_rad = bearings_rad(count, laser.fov_deg, laser.resolution_deg)
+        self._sparse = np.arange(count) % max(1, round(_GROUND_DEG / laser.resolution_deg)) == 0
         ages_s = beam_ages_s(laser.fov_deg, laser.resolution_deg, count)
         self._age_ns = np.round(ages_s * 1e9).astype(np.int64)
         self._youngest_ns = int(self._age_ns.min())
@@ -238,7 +240,7 @@ class LaserChannel:
         points = points_nav(every, self.mount).reshape(*gps_ns.shape, 3)
         moving = np.flatnonzero(~standing)
         reflectivity = np.stack([scan.reflectivity for scan in scans])[moving]
-        ground = self._ground.beams(range_m[moving], reflectivity, points[moving, :, 2])
+        ground = self._ground.beams(range_m[moving], reflectivity, points[moving, :, 2]) & self._sparse
         seen: defaultdict[int, list[_Sighting]] = defaultdict(list)  # by place
         for number, on_ground in zip(moving.tolist(), ground, strict=True):
             scan, first = scans[number], number * len(self._bearing_rad)
