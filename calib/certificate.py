@@ -12,28 +12,29 @@ Source: Briales, Gonzalez-Jimenez, Convex global 3D registration with Lagrangian
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
 import numpy as np
 
 from polecal.calib.geometry import Array, rotation
 from polecal.calib.observations import PARAMETERS
-from polecal.calib.solve import CLEARLY, Form, cost_m
+from polecal.calib.solve import CLEARLY, FLATTEST, ROUGHEST, Form, cost_m, ground_rows, roughness
 
 _NOTHING_M = 1e-4
 _FAINTEST = 1e-9  # of its best told direction: where the position is told less, rounding says where it is
 _ROUNDING = 1e-13  # of the largest number, for each of them that the sums went through
 _LOWEST_M2 = 1e-5  # of a sensor's squared height over its ground: far above where `Form.cost` ends the law
+_AWAY = np.array([0.1, 0.3, 0.7, 1.5])  # in the logarithm
 _CLOSER = 0.1  # to the cost than is needed to prove it: the bound is shown
-_LESS, _STEPS, _NEAR = 0.1, 30, 0.25
+_LESS, _STEPS, _NEAR = 0.01, 50, 0.25
 _LEAST_WEIGHT = 1e-13
 _ANGLES = frozenset({"roll", "pitch", "yaw"})
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """By how much of itself √c could at most be lower at another mount; weights, roughness and extras given.
+    """By how much of itself √c could at most be lower at another mount, the weights and extras given.
 
     1 where no bound is known. ``proven`` says that it is no more than 0.5 %, or 0.1 mm: of minima that are as
     near to one another as that, each is.
@@ -49,32 +50,62 @@ _UNKNOWN = Certificate(1.0, False)
 def certify(form: Form, vector: Array, held: Collection[str] = ()) -> Certificate:
     """Bound what ``form`` costs at any mount with the same ``held`` unknowns and extras as ``vector`` (12,).
 
-    What rough ground adds is -σ² ln s of the sensor's height squared s. That is nowhere below its tangent
-    at ``vector``, a form too, which is bounded in its place. How rough it is is given, too: as it looks at
-    ``vector``. No bound is given where the data do not tell a position that is not held, and where of the
-    angles others are held than none, roll and pitch, or all.
+    What rough ground adds, -σ² ln s of the sensor's height squared s, is nowhere below its tangent at
+    ``vector``, and what its roughness adds not below its chords (`_chords`): these are forms, too, which are
+    bounded in its place. No bound is given where the data do not tell a position that is not held, and where
+    of the angles others are held than none, roll and pitch, or all.
     """
-    form = form.of_known_roughness(vector)
     turned = _turned(vector, held)
-    reduced = None if turned is None else _without_position(form, vector, held)
-    if turned is None or reduced is None:
+    if turned is None:
         return _UNKNOWN
-    q, rounding = reduced
-    here, spread_m = form.spread(vector), cost_m(form, vector)
-    height = form.height_in_h(vector)
-    if height is not None:
+    here, spread_m, bent = form.spread(vector), cost_m(form, vector), np.zeros((6, 6))
+    if (height := form.height_in_h(vector)) is not None:
         height_m2 = float(height[:6] @ rotation(vector[3:6])[:, :2].T.ravel()) ** 2
         if height_m2 < _LOWEST_M2:
             return _UNKNOWN
         bent_m2 = form.balance * form.rough_m2
-        q[:6, :6] -= bent_m2 / height_m2 * np.outer(height[:6], height[:6])
+        bent = bent_m2 / height_m2 * np.outer(height[:6], height[:6])
         here -= bent_m2
+    parts = [(form, 0.0)]
+    if form.bumps is not None:
+        down = ground_rows(vector)[0]
+        bumps_m2 = float(down @ form.bumps @ down)
+        here += form.balance * (
+            form.rough_m2 * float(roughness(np.array(bumps_m2 / form.rough_m2))[0]) - bumps_m2
+        )
+        parts = _chords(form, bumps_m2 / form.rough_m2)
     least_m = min(CLEARLY * spread_m, spread_m - _NOTHING_M)
-    wanted = here - _CLOSER * (spread_m**2 - max(0.0, least_m) ** 2) + rounding
+    wanted = here - _CLOSER * (spread_m**2 - max(0.0, least_m) ** 2)
     known, equations, square = turned
-    lowest = _dual(known.T @ q @ known, equations, square, wanted) - rounding
+    lowest = np.inf
+    for part, more in parts:
+        reduced = _without_position(part, vector, held)
+        if reduced is None:
+            return _UNKNOWN
+        q, rounding = reduced
+        q[:6, :6] -= bent
+        bound = _dual(known.T @ q @ known, equations, square, wanted - more + rounding)
+        lowest = min(lowest, bound - rounding + more)
     bound_m = float(np.sqrt(max(0.0, spread_m**2 - max(0.0, here - lowest))))
     return Certificate(1.0 - bound_m / spread_m if spread_m else 0.0, bound_m >= least_m)
+
+
+def _chords(form: Form, at: float) -> list[tuple[Form, float]]:
+    """Give forms without bumps, and what to add to each, of which one at least is nowhere above ``form``.
+
+    Each is so where what the ground's roughness looks like, over what it was taken for, is between two
+    numbers: there the chord of `roughness` is not above it. They are the closer, the nearer to ``at``.
+    """
+    middle = min(at, ROUGHEST)
+    knots = middle * np.exp(np.concatenate([-_AWAY[::-1], [0.0], _AWAY]))
+    knots = np.array([FLATTEST, *knots[(knots > FLATTEST) & (knots < ROUGHEST)], ROUGHEST, 2.0 * ROUGHEST])
+    logarithms = roughness(knots)[0]
+    slopes = np.diff(logarithms) / np.diff(knots)
+    added = form.balance * form.rough_m2 * (logarithms[:-1] - slopes * knots[:-1])
+    return [
+        (replace(form, ground=form.ground + (slope - 1.0) * form.bumps, bumps=None), float(more))
+        for slope, more in zip(slopes, added, strict=True)
+    ]
 
 
 def _without_position(form: Form, vector: Array, held: Collection[str]) -> tuple[Array, float] | None:
@@ -131,18 +162,19 @@ def _dual(q: Array, equations: Array, square: float, wanted: float) -> float:
     scale = float(np.abs(np.linalg.eigvalsh(q)).max()) or 1.0
     q, gain = q / scale, np.eye(len(matrices))[-1]
     # All u are on a sphere, so that some sum of the equations is 1 but for the last: there Z > 0 begins.
-    at = np.linalg.lstsq(matrices.reshape(-1, size * size).T, -2.0 * np.eye(size).ravel(), rcond=None)[0]
-    z = q - np.tensordot(at, matrices, 1)
+    rows = matrices.reshape(-1, size * size)
+    at = np.linalg.lstsq(rows.T, -2.0 * np.eye(size).ravel(), rcond=None)[0]
+    z = q - (at @ rows).reshape(size, size)
     best, weight = -np.inf, 1.0
     while weight > _LEAST_WEIGHT and best < wanted:
         for _ in range(_STEPS):
-            pulled = np.linalg.solve(z, matrices)
-            gradient = gain / weight - np.trace(pulled, axis1=1, axis2=2)
-            curved = np.einsum("iab,jba->ij", pulled, pulled)
+            inverse = np.linalg.inv(z)
+            gradient = gain / weight - rows @ inverse.ravel()
+            curved = rows @ (inverse @ matrices @ inverse).reshape(rows.shape).T
             step = np.linalg.solve(curved, gradient)
             far = float(np.sqrt(max(0.0, gradient @ step)))
             at = at + step / (1.0 + far if far > _NEAR else 1.0)  # stays where Z > 0
-            z = q - np.tensordot(at, matrices, 1)
+            z = q - (at @ rows).reshape(size, size)
             if far <= _NEAR:
                 break
         least = float(np.linalg.eigvalsh(z)[0])

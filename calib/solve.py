@@ -9,7 +9,7 @@ ground adds to Eq. 6, the more the beams graze it, can be taken off.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,14 +34,15 @@ UNKNOWNS = (*PARAMETERS, *EXTRAS)
 CLEARLY = 0.995
 """Of √c: what is not lower than that is as low. On flat ground the mirror image is, but for the noise."""
 
+FLATTEST, ROUGHEST = 1e-6, 4.0
+"""Of the variance that the ground was taken for: between them `roughness` is a logarithm."""
+
 _STEPS = 100
 _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
 _NOTHING = 1e-15
 _STEP = 1e-5
 _DESCENTS = 40
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
-_LEAST_ROUGH = 1e-6  # of the ground's variance
-_MOST_ROUGH = 4.0  # the same
 _LEAST_M2 = 1e-6  # of a return's own variance: no laser is as good as 1 mm
 
 
@@ -411,17 +412,6 @@ class Form:
             told = told - min(self.rough_m2, float(down @ self.bumps @ down)) * np.outer(steeper, steeper)
         return pole[1] + self.balance * told
 
-    def of_known_roughness(self, vector: Array) -> Form:
-        """Give the form whose ground is as rough as it looks at ``vector`` (12,).
-
-        Without ``bumps``; but for a constant nowhere lower than this one, and at ``vector`` as steep.
-        """
-        if self.bumps is None:
-            return self
-        down = ground_rows(vector)[0]
-        less = float(roughness(down @ self.bumps @ down / self.rough_m2)[1]) - 1.0
-        return replace(self, ground=self.ground + less * self.bumps, bumps=None)
-
     def in_h(self, vector: Array) -> Array:
         """Give the form (10, 10) of h that `spread` is at the extras of ``vector`` (12,)."""
         base, q = _h_base(vector), np.zeros((10, 10))
@@ -487,8 +477,8 @@ def roughness(rough: Array) -> tuple[Array, Array]:
     From four times as rough on the logarithm goes on straight: else it would hardly mind a mount that tilts
     all of the ground.
     """
-    near = np.clip(rough, _LEAST_ROUGH, _MOST_ROUGH)
-    return np.log(near) + np.maximum(rough - _MOST_ROUGH, 0.0) / _MOST_ROUGH, 1.0 / near
+    near = np.clip(rough, FLATTEST, ROUGHEST)
+    return np.log(near) + np.maximum(rough - ROUGHEST, 0.0) / ROUGHEST, 1.0 / near
 
 
 def _jacobian(weight: Array, dweight: Array, h: Array, dh: Array) -> Array:
