@@ -29,33 +29,35 @@ class _Hull:
     y: list[int]
 
     def add(self, x: int, y: int) -> None:
-        while len(self.x) > 1:
-            x1, y1, x2, y2 = self.x[-2], self.y[-2], self.x[-1], self.y[-1]
-            if (y2 - y1) * (x - x2) < (y - y2) * (x2 - x1):
+        xs, ys = self.x, self.y
+        while len(xs) > 1:
+            x2, y2 = xs[-1], ys[-1]
+            if (y2 - ys[-2]) * (x - x2) < (y - y2) * (x2 - xs[-2]):
                 break
-            self.x.pop()
-            self.y.pop()
-        self.x.append(x)
-        self.y.append(y)
+            xs.pop()
+            ys.pop()
+        xs.append(x)
+        ys.append(y)
 
     def line(self, steepest: float) -> tuple[float, float]:
         """Give slope and offset of the line through the edge over the middle, or no steeper below it.
 
         Where first stamps were all late, that edge falls more than a clock can: then the next that does not.
         """
-        if len(self.x) < 2:
-            return 0.0, float(self.y[0])
-        edge = max(1, bisect_left(self.x, (self.x[0] + self.x[-1]) / 2))
+        xs, ys = self.x, self.y
+        if len(xs) < 2:
+            return 0.0, float(ys[0])
+        edge = max(1, bisect_left(xs, (xs[0] + xs[-1]) / 2))
         while True:
-            (x0, x1), (y0, y1) = self.x[edge - 1 : edge + 1], self.y[edge - 1 : edge + 1]
+            x0, x1, y0, y1 = xs[edge - 1], xs[edge], ys[edge - 1], ys[edge]
             slope = (y1 - y0) / (x1 - x0)
-            if slope >= -steepest or edge == len(self.x) - 1:
+            if slope >= -steepest or edge == len(xs) - 1:
                 break
             edge += 1
         if abs(slope) <= steepest:  # of an edge of the hull all other points lie above its line
             return slope, min(y0 - slope * x0, y1 - slope * x1)
         slope = max(-steepest, min(steepest, slope))
-        return slope, min(y - slope * x for x, y in zip(self.x, self.y, strict=True))
+        return slope, min(y - slope * x for x, y in zip(xs, ys, strict=True))
 
 
 class Clock:
@@ -91,10 +93,11 @@ class Clock:
 
         So does, while the map is not `locked`, one that shows the first to have been far too late.
         """
+        x = device_ns - self._device0_ns
         if self._old is not None:
             late_ns = host_ns - self.to_host(device_ns)
-            if device_ns <= self._last_ns + self._device0_ns:
-                if device_ns == self._last_ns + self._device0_ns:
+            if x <= self._last_ns:
+                if x == self._last_ns:
                     return
                 late_ns = _JUMP_NS + 1  # time went back
             early_ns = -late_ns if self.locked else self._earlier_than_first_ns(device_ns, host_ns)
@@ -104,7 +107,7 @@ class Clock:
         if self._old is None or self._young is None:
             self._device0_ns, self._host0_ns = device_ns, host_ns
             self._old, self._young = _Hull([], []), _Hull([], [])
-        x = device_ns - self._device0_ns
+            x = 0
         y = host_ns - self._host0_ns - x
         self._last_ns = x
         if x - self._first_ns >= 2 * self._half_ns and self._young.x:
