@@ -110,6 +110,7 @@ def meet(clock, connected):
         clock.at(at_most_s, lambda: stop.set() if clock.ns >= due_ns else None)
         device.on_scan = lambda: stop.set() if len(device.scans) >= scans else None
         device.run(device.open(stop))
+        del device.scans[scans:]  # which were heard at once with the last
         return device
 
     return run
@@ -472,7 +473,7 @@ def test_the_stream_is_back_within_3_s_of_the_wire_being_good(  # noqa: PLR0917
     device = meet(wire, Watched(), scans=10**6, at_most_s=begins_s + bad_s + 4.5)
     back = [t_ns for t_ns, _ in device.scans if t_ns > good_ns]
     assert (back[0] - good_ns) * 1e-9 < GOOD_AGAIN_S
-    assert back[-1] > good_ns + 4.4 * SECOND  # and stays
+    assert back[-1] > good_ns + 4.3 * SECOND  # and stays; the last 0.1 s are not looked at
     let_through = {frame.data for _, frame in device.scans} - wire.true
     assert not let_through  # the CRC is weak (test_framer.py): of few wrong bits it misses one case in 1000
     assert (laser.mode, laser.eeprom_writes) == (Mode.REQUEST, 0)
