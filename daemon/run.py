@@ -35,7 +35,7 @@ from polecal.drivers.port import Direction, Port, Tap
 from polecal.drivers.sick_lms import SickLms
 
 _LOOK_S = 0.5
-_TOGETHER_S = 0.02  # between two looks: waking for each chunk costs more than hearing it
+_TOGETHER_S = 0.05  # between two looks: waking for each chunk costs more than hearing it
 _PATIENCE_S = 0.3  # a status waits no longer for one that is being calculated
 _WRITE_AGAIN_S = 1.0
 
