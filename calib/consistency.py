@@ -32,16 +32,16 @@ def jump(left_out: Array) -> Jump | None:
     spread = left_out[:, : len(PARAMETERS)] - left_out[0, : len(PARAMETERS)]
     spread[:, 3:6] = wrap(spread[:, 3:6])
     say = (1 - passes) * (spread - spread.mean(axis=0))
-    splits = range(_FEWEST_BEFORE, passes)
-    most = exceeded(_FALSE_ALARMS / len(splits) / len(PARAMETERS), passes - 2)
-    found, worst = None, most
-    for split in splits:
-        before, after = say[:split], say[split:]
-        by = after.mean(axis=0) - before.mean(axis=0)
-        about = (before.var(axis=0) * split + after.var(axis=0) * (passes - split)) / (passes - 2)
-        sigma = np.sqrt(about * (1 / split + 1 / (passes - split)))
-        ratio = np.abs(by) / np.maximum(sigma, 1e-12)
-        index = int(np.argmax(ratio))
-        if ratio[index] > worst:
-            found, worst = Jump(index, float(by[index]), split), float(ratio[index])
-    return found
+    before = np.arange(_FEWEST_BEFORE, passes)[:, None]  # a row a split
+    after = passes - before
+    most = exceeded(_FALSE_ALARMS / len(before) / len(PARAMETERS), passes - 2)
+    summed = np.cumsum(say, axis=0)[_FEWEST_BEFORE - 1 : -1]
+    means = summed / before, (say.sum(axis=0) - summed) / after
+    about = ((say**2).sum(axis=0) - before * means[0] ** 2 - after * means[1] ** 2) / (passes - 2)
+    by = means[1] - means[0]
+    sigma = np.sqrt(np.maximum(0.0, about) * (1 / before + 1 / after))
+    ratio = np.abs(by) / np.maximum(sigma, 1e-12)
+    split, index = divmod(int(np.argmax(ratio)), len(PARAMETERS))
+    return (
+        Jump(index, float(by[split, index]), _FEWEST_BEFORE + split) if ratio[split, index] > most else None
+    )

@@ -211,8 +211,8 @@ def _numbered(pass_id: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np
         numbers, index = np.unique(pass_id, return_inverse=True)
         return numbers, index
     there = np.bincount(pass_id - lowest) > 0
-    numbers = np.flatnonzero(there) + lowest
-    return numbers, (np.cumsum(there) - 1)[pass_id - lowest]
+    index = pass_id - lowest
+    return np.flatnonzero(there) + lowest, index if there.all() else (np.cumsum(there) - 1)[index]
 
 
 def calibrate(

@@ -42,6 +42,8 @@ _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
 _NOTHING = 1e-15
 _STEP = 1e-5
 _DESCENTS = 40
+_AGAINST = -skew(np.eye(3))  # -[e]×
+_SETTLED, _SETTLED_TURNS = 1e-9, 5  # of c; where no descent gains that any more, in so many turns
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
 _LEAST_M2 = 1e-6  # of a return's own variance: no laser is as good as 1 mm
 
@@ -598,11 +600,11 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
     whole[free] += to_position
     q7 = whole.T @ q @ whole
     turns = rotation(start[3:6]) @ ICOSAHEDRAL
-    cost, damping = _cost7(q7, turns), np.full(len(turns), 1e-3)
+    cost, damping, settled = _cost7(q7, turns), np.full(len(turns), 1e-3), 0
     for _ in range(_DESCENTS):
         u = _u(turns)
         jacobian = np.zeros((len(turns), 7, 3))  # of R exp([δ]×): d(R e) = -R [e]× δ
-        jacobian[:, :3], jacobian[:, 3:6] = -turns @ skew(np.eye(3)[0]), -turns @ skew(np.eye(3)[1])
+        jacobian[:, :3], jacobian[:, 3:6] = turns @ _AGAINST[0], turns @ _AGAINST[1]
         pulled = q7 @ jacobian
         gradient = np.einsum("bik,bi->bk", pulled, u)
         hessian = np.einsum("bik,bil->bkl", jacobian, pulled)
@@ -611,6 +613,9 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
         turned = turns @ turning(step[:, :, 0])
         lower = _cost7(q7, turned)
         better = lower < cost
+        settled = 0 if (lower < cost - _SETTLED * np.abs(cost)).any() else settled + 1
+        if settled == _SETTLED_TURNS:
+            break
         turns[better], cost = turned[better], np.minimum(cost, lower)
         damping = np.clip(np.where(better, damping * _EASED, damping * _DAMPED), 1e-12, _GIVE_UP)
     best = turns[int(np.argmin(cost))]
@@ -628,7 +633,7 @@ def _u(turns: Array) -> Array:
 
 def _cost7(q7: Array, turns: Array) -> Array:
     u = _u(turns)
-    costs: Array = np.einsum("bi,ij,bj->b", u, q7, u)
+    costs: Array = ((u @ q7) * u).sum(axis=1)
     return costs
 
 
