@@ -17,7 +17,8 @@ from polecal.calib import (
     Setup,
     estimate,
 )
-from polecal.calib.estimate import passes_of
+from polecal.calib.certificate import Certificate
+from polecal.calib.estimate import Shared, passes_of
 from polecal.calib.observations import points_body
 from polecal.calib.report.evidence import Seen, gather, largest, moved, placed_to_m
 from polecal.calib.report.figures import HEADINGS
@@ -273,6 +274,22 @@ def test_the_page_says_what_was_found_and_is_whole(page, result):
         one.png.startswith(b"\x89PNG") and one.alt in html.unescape(page.html) for one in page.drawings
     )
     assert len(page.html) < 3e6
+
+
+def test_the_page_says_whether_the_cost_is_proven_to_be_the_lowest_and_what_another_laser_has_helped(
+    returns, setup, result, evidence, page
+):
+    assert "lower cost" not in page.html, "where that was not asked"
+    for proven, words in ((True, "cost is proven."), (False, "cost is not proven; the search")):
+        told = replace(
+            result,
+            certificate=Certificate(0.001, proven),
+            shared=Shared("rear", 12, {"x": 0.7, "y": 0.82, "roll": 0.6}),
+        )
+        text = page_of(returns, setup, told, evidence).html
+        assert f"That no other mount has a lower {words}" in text
+        assert "12 passes that rear saw, too" in text
+        assert "σ is of x 0.70, of y 0.82 and of roll 0.60 of what it was without." in text
 
 
 def test_what_others_wrote_is_text_and_never_markup(page):
