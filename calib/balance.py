@@ -17,6 +17,7 @@ from polecal.calib.subsets import Subsets
 from polecal.calib.uncertainty import jackknife
 
 _TRIED = 13
+_NEARLY = 0.1  # of the variances' product
 _NOTHING = 1e-18
 
 
@@ -26,16 +27,17 @@ def balance(near: Subsets, without: NDArray[np.bool_], known: Array, most: float
     Tried are some from that of Eq. 7, 1, to ``most``: that of returns which are all independent. For each,
     every solution is one step of Newton's from where the passes are looked at, ``near`` the minimum.
     ``known`` (12,) is what is known of each unknown beforehand, as half of a Hessian's diagonal. The scatters
-    of the mount's free unknowns count alike: their product is to be the least.
+    of the mount's free unknowns count alike: their product is to be the least. Of balances that are nearly
+    as good the one next to ``most`` is taken: which is the best is in part their own scatter.
     """
     pole, ground = near.sides(without)
     beforehand = np.diag(known[near.free])
     tried = most ** np.linspace(0.0, 1.0, _TRIED)
-    products = []
+    logs = []
     for one in tried:
         gradient, information = (of_pole + one * of for of_pole, of in zip(pole, ground, strict=True))
         steps = np.zeros((len(without), len(UNKNOWNS)))
         steps[:, near.free] = -np.linalg.solve(information + beforehand, gradient[:, :, None])[:, :, 0]
         scatter = np.diag(jackknife(steps))[: len(PARAMETERS)]
-        products.append(np.log(np.maximum(scatter, _NOTHING)).sum())
-    return float(tried[np.argmin(products)])
+        logs.append(np.log(np.maximum(scatter, _NOTHING)).sum())
+    return float(tried[np.flatnonzero(logs <= min(logs) + _NEARLY)[-1]])

@@ -296,7 +296,7 @@ def test_taking_rough_grounds_bias_off_changes_nothing_on_smooth_ground(rig):
 def test_roughness_that_is_sought_does_no_harm_on_smooth_ground(rig):
     plain = replace(SETUP, rough_ground=False)
     without, with_it = errors_of_many_drives(rig, plain, SETUP, rough_m=0.0)
-    assert (rms(with_it) < 1.05 * rms(without)).all()
+    assert (rms(with_it) < 1.1 * rms(without)).all()
     assert (rms(with_it - without) < 0.25 * rms(without)).all()
 
 
