@@ -424,6 +424,7 @@ class _Problem:
             if not enough:  # few passes can be fitted by a mount that cannot be: it is not their noise
                 far = np.abs(vector - measured) / (_FARTHEST * self._measured_sigma)
                 doubt = np.maximum(doubt, far * free)
+            doubt = np.where(free, np.nan_to_num(doubt, nan=np.inf), 0.0)  # what is no number is not told
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
                 return _Found(vector, covariance, frozenset(held), whole, bend, subsets, left_out)

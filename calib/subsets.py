@@ -90,8 +90,7 @@ class Subsets:
         gradient, information = ground[:, :, 0], ground[:, :, 1:]
         if self.weights.rough_m2:
             count = parts * self.ground.count
-            ray = count @ self.ground.ray
-            steeper = ray[:, 1:] / ray[:, :1]
+            steeper = _steeper(count @ self.ground.ray, np.eye(1, pole.shape[2]))
             gradient = gradient - self.weights.rough_m2 * steeper
             bumps = _mixed(parts, self.ground.within) / np.maximum(1.0, count.sum(axis=1))[:, None, None]
             rough_m2 = bumps[:, :1, 0]
@@ -170,7 +169,7 @@ class _Cost:
         if not self._rough_m2:
             return gradient, hessian
         rough = (self._balance * self._rough_m2)[:, None]
-        steeper = self._ray[:, 1:] / _dot(self._ray, row)[:, None]
+        steeper = _steeper(self._ray, row)
         gradient = gradient - rough * steeper
         hessian += rough[:, :, None] * _outer(steeper)
         pulled = _times(self._bumps, row)
@@ -200,6 +199,13 @@ def _mixed(weights: Array, matrices: Array) -> Array:
     """Give Σ of P matrices (P, …) by weights (B, P): (B, …)."""
     mixed: Array = (weights @ matrices.reshape(len(matrices), -1)).reshape(-1, *matrices.shape[1:])
     return mixed
+
+
+def _steeper(ray: Array, row: Array) -> Array:
+    """Give the derivative (B, M) of ln of the sensor's height; 0 where a subset has no ground."""
+    height = _dot(ray, row)[:, None]
+    steeper: Array = ray[:, 1:] / np.where(height == 0.0, np.inf, height)
+    return steeper
 
 
 def _row(step: Array) -> Array:

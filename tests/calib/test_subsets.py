@@ -97,6 +97,18 @@ def test_a_pass_that_comes_later_counts_as_if_it_had_been_there(problem, passes)
     assert one == pytest.approx(other, abs=1e-9)
 
 
+@pytest.mark.parametrize("only", [0, 3])
+def test_ground_that_one_pass_alone_has_seen_is_not_believed(rig, only):
+    """Without that pass nothing is known of it: no number may come of nothing."""
+    rough = Rig(rig.true, passes=8, rough_m=0.03)
+    returns = drive(rough, np.random.default_rng(1), 800, 4000)
+    once = returns[(returns.kind == Kind.POLE) | (returns.pass_id == only)]
+    result = estimate(passes_of(once, 30), Setup(rig.measured, extras=frozenset()))
+    assert "z" in result.held
+    assert np.isfinite(result.covariance).all()
+    assert not result.verdict.accepted
+
+
 def test_a_pass_without_ground_is_left_out_like_any_other(rig):
     returns = rig.drive(noise_m=0.01, nav_m=0.01, passes=8)
     bare = returns[(returns.pass_id != 3) | (returns.kind == Kind.POLE)]
