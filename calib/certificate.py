@@ -168,10 +168,13 @@ def _dual(q: Array, equations: Array, square: float, wanted: float) -> float:
     best, weight = -np.inf, 1.0
     while weight > _LEAST_WEIGHT and best < wanted:
         for _ in range(_STEPS):
-            inverse = np.linalg.inv(z)
-            gradient = gain / weight - rows @ inverse.ravel()
-            curved = rows @ (inverse @ matrices @ inverse).reshape(rows.shape).T
-            step = np.linalg.solve(curved, gradient)
+            try:
+                inverse = np.linalg.inv(z)
+                gradient = gain / weight - rows @ inverse.ravel()
+                curved = rows @ (inverse @ matrices @ inverse).reshape(rows.shape).T
+                step = np.linalg.solve(curved, gradient)
+            except np.linalg.LinAlgError:  # no digits left
+                return best
             far = float(np.sqrt(max(0.0, gradient @ step)))
             at = at + step / (1.0 + far if far > _NEAR else 1.0)  # stays where Z > 0
             z = q - (at @ rows).reshape(size, size)
@@ -180,7 +183,7 @@ def _dual(q: Array, equations: Array, square: float, wanted: float) -> float:
         least = float(np.linalg.eigvalsh(z)[0])
         best = max(best, scale * (float(at[-1]) + square * min(0.0, least)))
         if least <= 0.0:
-            break  # no digits left
+            break
         weight *= _LESS
     return best
 

@@ -34,7 +34,7 @@ HEADINGS = (
 )
 UNITS = np.array([1e3, 1e3, 1e3, *np.degrees([1, 1, 1])])  # rows are in mm and °
 
-RUNS = 200
+RUNS = 100
 PASSES = 36
 RIG = Rig(
     Mount(-0.029, -0.360, -0.996, -0.528, -8.182, -2.017),

@@ -109,6 +109,16 @@ def test_nothing_is_proven_where_the_sensor_is_in_the_ground(passes):
     assert not certify(buried, START).proven
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e12, 1e30])
+def test_numbers_of_whatever_size_give_a_bound_or_none_but_no_error(passes, scale):
+    form = form_of(passes, sought=False)
+    other = replace(form, pole=scale * form.pole, rough_m2=0.0, ray=None)
+    found = minimise_globally(other, START, EXTRAS)
+    wrong = found + np.pi * np.eye(12)[5]
+    assert 0.0 <= certify(other, found).lower_by <= 1.0
+    assert not certify(other, wrong).proven or cost_m(other, wrong) < 1.005 * cost_m(other, found)
+
+
 def test_a_perfect_fit_is_the_lowest(rig):
     passes = passes_of(rig.drive(), 30)
     pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.0) for kind in Kind)
