@@ -234,7 +234,8 @@ _SHORT_ASCII = re.compile(rb"%[A-Z][A-Z0-9_]{1,40},\d+,\d+\.?\d*;.*\*([0-9A-Fa-f
 _NMEA = re.compile(rb"\$[A-Z][A-Z0-9]{2,},.*\*([0-9A-Fa-f]{2})")
 _LOOKS_ASCII = re.compile(rb"[#%$][A-Z][A-Z0-9_]+,")
 
-_Match = tuple[Kind, int] | Fault | None  # a frame and where it ends, not a frame, or too little to tell
+_Match = tuple[Kind, int] | Fault | int | None
+"""A frame and where it ends, or not a frame; or too little to tell: then how far it will reach, if known."""
 
 
 _SYNCS = {
@@ -271,7 +272,7 @@ def _binary(buffer: bytes, at: int) -> _Match:
         return match
     _, end = match
     if end > len(buffer):
-        return None
+        return end
     return match if crc32(buffer[at:end]) == 0 else Fault.CRC  # over its own CRC too it is 0
 
 
@@ -395,11 +396,14 @@ class Framer:
             return []
         frames: list[Frame] = []
         junk_at, reason = 0, Fault.NOISE  # where the bytes begin that belong to no frame, and why
-        at = 0
+        at = self._announced = 0
         while start := _START.search(buffer, at):
             at = start.start()
             match = _MATCHERS[buffer[at]](buffer, at)
             if match is None:
+                break
+            if isinstance(match, int):
+                self._announced = match - at
                 break
             if isinstance(match, Fault):
                 if match is not Fault.NOISE:
@@ -417,8 +421,6 @@ class Framer:
             at = len(buffer)
         self._skip(buffer, junk_at, at, reason)
         self._rest = buffer[at:]
-        extent = _extent(self._rest, 0) if self._rest.startswith(b"\xaa") else None
-        self._announced = extent[1] if isinstance(extent, tuple) else 0
         self._offset += at
         while self._chunks and self._chunks[0][0] <= self._offset:
             self._chunks.popleft()
