@@ -142,6 +142,19 @@ def test_a_laser_that_was_knocked_during_the_drive_does_not_pull_the_other(drive
     assert worst < 3.0
 
 
+@pytest.mark.parametrize("late_s", [0.01, 0.05])
+def test_a_laser_whose_stamps_are_late_does_not_pull_one_that_saw_the_fast_passes_alone(driven, late_s):
+    """What a late stamp adds to its x in those passes is no error of the navigation's."""
+    for one, other in driven[:3]:
+        late = replace(one, position_m=one.position_m - late_s * one.velocity_mps)
+        front = witness("front", late, FRONT)
+        front = replace(front, result=replace(front.result, verdict=Verdict(True, ())))
+        second = witness("second", other, BESIDE, of=lambda number: number % 3 == 1)
+        sigma = np.sqrt(np.diag(second.result.covariance))
+        result = share((front, second)).get("second", second.result)
+        assert (np.abs(result.mount.vector - second.result.mount.vector) < 2.0 * sigma).all()
+
+
 def test_who_is_not_accepted_neither_gives_nor_takes(pairs):
     front, second = pairs[0]
     refused = Verdict(False, ("the pole fell over",))
