@@ -23,6 +23,7 @@ from polecal.daemon import archive, log, reporting, route, sessions, shelf
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, asker, code_of
 from polecal.daemon.finalise import Finaliser
+from polecal.daemon.memory import give_back
 from polecal.daemon.notify import Manager, summary
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.routine import ENDED, State
@@ -312,6 +313,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _serve(path: str, config: Config) -> int:
     sys.setswitchinterval(_SWITCH_S)
+    give_back()
     faulthandler.enable()  # the watchdog ends by SIGABRT: the log then has where each thread was
     signals: queue.SimpleQueue[int] = queue.SimpleQueue()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from polecal.daemon.config import load
+from polecal.daemon.memory import give_back
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Recorder
 
@@ -36,6 +37,7 @@ def tell(pipeline: Pipeline, t_s: float) -> None:
 
 
 def main(config_file: str, capture_file: str, every_s: float) -> None:
+    give_back()  # as polecald does
     config = load(config_file)
     devices = [*(laser.name for laser in config.lasers), "span"]
     pipeline = Pipeline(config)
