@@ -18,6 +18,7 @@ from polecal.calib.solve import Along, Scatter, Weights, ground_basis, pole_basi
 _STEPS = 30
 _DAMPING, _EASED, _STIFFER, _GIVE_UP = 1e-12, 0.1, 100.0, 1e6
 _NOTHING = 1e-12
+_FLAT = 1e-9  # of the largest: an unknown that nothing tells
 _LEAST = 1e-6  # of a height in m
 
 
@@ -107,7 +108,8 @@ class Subsets:
         value, damping = cost.at(step), np.full(len(subsets), _DAMPING)
         for _ in range(_STEPS):
             gradient, hessian = cost.slopes(step)
-            scale = np.sqrt(np.abs(np.einsum("bii->bi", hessian))) + 1e-150
+            curved = np.sqrt(np.abs(np.einsum("bii->bi", hessian)))
+            scale = np.maximum(curved, _FLAT * curved.max(axis=1, initial=0.0, keepdims=True)) + 1e-150
             scaled = hessian / scale[:, :, None] / scale[:, None]
             scaled += damping[:, None, None] * np.eye(step.shape[1])
             way = -np.linalg.solve(scaled, (gradient / scale)[:, :, None])[:, :, 0] / scale
