@@ -108,7 +108,7 @@ def place_known(turn: int, seed: int) -> np.ndarray:
     (returns,) = drives(RIG, [RIG.mount], seed, 200 * PASSES, 400 * PASSES)
     passes = passes_of(returns, 30)[: PASSES * turn // 360]
     used = np.ones(len(passes), dtype=bool)
-    pole, ground = (scatter_of([one.total(kind) for one in passes], kind, 0.04) for kind in Kind)
+    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.04) for kind in Kind)
     start = np.concatenate([RIG.mount.vector, np.zeros(len(EXTRAS))])
     form = Form(pole.form(used, 1.0), ground.form(used, 1.0))
     total, mean = pole.weighted_mean(used, 1.0)  # from n's origin, where the pole is
