@@ -100,7 +100,7 @@ def judge(
     if improvement is None or doubling is None:
         unsettled = ["the cost's improvement is not known yet"]
     grounds = [] if criteria.mode == "any" and not (dear and unsettled) else dear + unsettled
-    if jump is not None and abs(jump.by) > criteria.max_sigma[jump.index]:
+    if jump is not None:
         grounds.append(
             f"{PARAMETERS[jump.index]} is {_shown(jump.index, abs(jump.by))} different after the first "
             f"{jump.first_passes} passes: check that laser, antenna and pole are fast, and drive anew"

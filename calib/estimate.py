@@ -490,7 +490,9 @@ class _Problem:
             improvement=improvement,
             doubling=doubling,
             last_set_aside=set_aside.get(self._passes[-1].id),
-            jump=None if found.left_out is None else consistency.jump(found.left_out),
+            jump=None
+            if found.left_out is None
+            else consistency.jump(found.left_out, setup.criteria.max_sigma),
             sigma=sigma,
             held=tuple(held),
             shift=(vector - self._measured)[:6],
