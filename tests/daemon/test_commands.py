@@ -228,18 +228,19 @@ def test_a_passs_file_has_the_arrays_that_are_told_in_their_shapes(recorded):
     assert re.fullmatch(r"front-\d{3}\.npz", first.name)
     with np.load(first) as file:
         shapes = {name: file[name].shape for name in file.files}
+        k = file["block_features"].sum(axis=1)
     assert sorted(table("passes/NAME-NNN.npz")) == sorted(shapes)
-    n, b = len(np.load(first)["range_m"]), len(np.load(first)["block_count"])
+    sizes_of = {
+        "N": len(np.load(first)["range_m"]),
+        "B": len(np.load(first)["block_count"]),
+        "T": int((k * (k + 1) // 2).sum()),
+    }
     part = FORMATS.split("## passes/NAME-NNN.npz\n")[1].split("\n## ")[0]
     for names, told in re.findall(r"^\| (`.*?) \| (.*?) \|", part, re.MULTILINE):
         every = re.findall(r"`([^`]+)`", names)
         wanted = told.split("; ") if ";" in told else [told] * len(every)
         for name, shape in zip(every, wanted, strict=True):
-            sizes = (
-                []
-                if shape == "–"
-                else [{"N": n, "B": b}.get(size) or int(size) for size in shape.split(" × ")]
-            )
+            sizes = [] if shape == "–" else [sizes_of.get(size) or int(size) for size in shape.split(" × ")]
             assert shapes[name] == tuple(sizes), name
 
 
