@@ -157,12 +157,15 @@ def by_group(
     sums: dict[int, tuple[int, Array | float, Array | float]] = {}
     size = _BLOCK // len(summed)
     for start in range(0, len(index), size):
-        block = group[start : start + size]
-        features = _features(returns, index[start : start + size], sorted(axes), parts)
+        block, some = group[start : start + size], index[start : start + size]
+        beside = bool((np.diff(some) == 1).all())  # then they are looked at where they are
+        picked = slice(int(some[0]), int(some[-1]) + 1) if beside else some
+        features = _features(returns, picked, sorted(axes), parts)
         for begin, end in pairwise([0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(block)]):
-            some, number = features[:, begin:end], int(block[begin])
+            of_group, number = features[:, begin:end], int(block[begin])
             count, first, second = sums.get(number, (0, 0.0, 0.0))
-            sums[number] = count + end - begin, first + some.sum(axis=1), second + some @ some.T
+            first = first + of_group.sum(axis=1)
+            sums[number] = count + end - begin, first, second + of_group @ of_group.T
     return {
         number: of_sums(count, summed, np.asarray(first), np.asarray(second))
         for number, (count, first, second) in sums.items()
@@ -170,7 +173,7 @@ def by_group(
 
 
 def _features(
-    returns: Returns, index: NDArray[np.int64], axes: Sequence[int], parts: Sequence[slice]
+    returns: Returns, index: NDArray[np.int64] | slice, axes: Sequence[int], parts: Sequence[slice]
 ) -> Array:
     """Give the ``parts`` of [G | cos θ C | sin θ C | Ġ | G̈/2], each feature a row: (axes × features, N)."""
     bearing = returns.bearing_rad[index]
@@ -178,7 +181,7 @@ def _features(
     flat = returns.range_m[index] * across
     c = rotation_rows(returns.rpy_rad[index], axes)  # axis of n, of b, return
     position = returns.position_m[index].T[axes]
-    features = np.empty((len(axes), sum(part.stop - part.start for part in parts), len(index)))
+    features = np.empty((len(axes), sum(part.stop - part.start for part in parts), len(bearing)))
     _move(c, position, flat, features[:, BASE])
     if RANGE in parts:
         np.multiply(
@@ -190,7 +193,7 @@ def _features(
         twist = (_crossed(turn, rate) + _crossed(c, angular_acceleration)) / 2  # C̈/2
         _move(turn, velocity[axes], flat, features[:, -20:-10])
         _move(twist, acceleration[axes] / 2, flat, features[:, -10:])
-    return features.reshape(-1, len(index))
+    return features.reshape(-1, len(bearing))
 
 
 def _move(matrix: Array, vector: Array, flat: Array, moved: Array) -> None:

@@ -43,7 +43,10 @@ _NOTHING = 1e-15
 _STEP = 1e-5
 _DESCENTS = 40
 _AGAINST = -skew(np.eye(3))  # -[e]×
-_SETTLED, _SETTLED_TURNS = 1e-9, 5  # of c; where no descent gains that any more, in so many turns
+_SETTLED, _SETTLED_TURNS = (
+    1e-6,
+    3,
+)  # of c; where at its pace no descent gets that much below the lowest any more
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
 _LEAST_M2 = 1e-6  # of a return's own variance: no laser is as good as 1 mm
 
@@ -601,7 +604,7 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
     q7 = whole.T @ q @ whole
     turns = rotation(start[3:6]) @ ICOSAHEDRAL
     cost, damping, settled = _cost7(q7, turns), np.full(len(turns), 1e-3), 0
-    for _ in range(_DESCENTS):
+    for left in reversed(range(_DESCENTS)):
         u = _u(turns)
         jacobian = np.zeros((len(turns), 7, 3))  # of R exp([δ]×): d(R e) = -R [e]× δ
         jacobian[:, :3], jacobian[:, 3:6] = turns @ _AGAINST[0], turns @ _AGAINST[1]
@@ -613,10 +616,15 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
         turned = turns @ turning(step[:, :, 0])
         lower = _cost7(q7, turned)
         better = lower < cost
-        settled = 0 if (lower < cost - _SETTLED * np.abs(cost)).any() else settled + 1
+        before, cost = cost, np.minimum(cost, lower)
+        pace, lead = (
+            np.log(np.maximum(of, _NOTHING) / np.maximum(least, _NOTHING))
+            for of, least in ((before, cost), (cost, cost.min()))
+        )
+        settled = 0 if (left * pace > lead + _SETTLED).any() else settled + 1
+        turns[better] = turned[better]
         if settled == _SETTLED_TURNS:
             break
-        turns[better], cost = turned[better], np.minimum(cost, lower)
         damping = np.clip(np.where(better, damping * _EASED, damping * _DAMPED), 1e-12, _GIVE_UP)
     best = turns[int(np.argmin(cost))]
     vector = start.copy()
