@@ -400,27 +400,28 @@ class _Problem:
             whole = replace(whole, balance=less * whole.balance)
         search = solve.minimise_globally if everywhere else solve.minimise
         at_measured = whole.information(measured)
-        vector, bend = about, None
+        vector, bend = about, np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
         while True:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
             squared = max((paper if weights.ground_return else whole).spread(vector), _LEAST_M**2)
-            bend = whole.bend(vector) if bend is None else bend
-            subsets = left_out = None
-            if enough:
-                subsets = Subsets.near(self.pole, self.ground, weights, vector, free)
-                left_out = subsets.minima(_each_but_one(used), bend)
-                covariance = jackknife(left_out)
-            else:
-                covariance = from_model(whole.information(vector), squared, len(numbers), free)
             # A scatter cannot see what no pass tells at all; what all returns, were they independent, could
             # tell at best can. Where the minimum is may hide it: off level the cosine of a level sensor's
             # pitch stretches the ranges, and noise puts it there. So it must be told at the measured mount,
             # too.
-            count = int(self.pole.count[used].sum())
-            informations = whole.information(vector), at_measured
-            best = [np.diag(from_model(of, squared, count, free)) for of in informations]
-            doubt = np.sqrt(np.maximum(np.diag(covariance), np.maximum(*best))) / believable
+            count, information = int(self.pole.count[used].sum()), whole.information(vector)
+            best = [np.diag(from_model(of, squared, count, free)) for of in (information, at_measured)]
+            variance, subsets, left_out = np.maximum(*best), None, None
+            if not enough:
+                covariance = from_model(information, squared, len(numbers), free)
+                variance = np.maximum(variance, np.diag(covariance))
+            elif (variance <= believable**2).all():
+                subsets = Subsets.near(self.pole, self.ground, weights, vector, free)
+                bend = whole.bend(vector)
+                left_out = subsets.minima(_each_but_one(used), bend)
+                covariance = jackknife(left_out)
+                variance = np.maximum(variance, np.diag(covariance))
+            doubt = np.sqrt(variance) / believable
             if not enough:  # few passes can be fitted by a mount that cannot be: it is not their noise
                 far = np.abs(vector - measured) / (_FARTHEST * self._measured_sigma)
                 doubt = np.maximum(doubt, far * free)
