@@ -369,40 +369,35 @@ class Form:
     def spread(self, vector: Array) -> float:
         """Give the quadratic part of c in m² at ``vector`` (12,), the variances of Eq. 7 in balance."""
         h = _h(vector)
-        pole, ground = _rows(_pole_weights(vector)[0], h), _rows(_ground_weights(vector)[0], h)
+        return self._spread(_rows(_pole_weights(vector)[0], h), _rows(_ground_weights(vector)[0], h))
+
+    def _spread(self, pole: Array, ground: Array) -> float:
         return float((pole @ self.pole * pole).sum() + self.balance * (ground @ self.ground * ground).sum())
 
     def cost(self, vector: Array) -> float:
         """Give what is minimised, c in m² at ``vector`` (12,); on rough ground it may be negative."""
+        h = _h(vector)
+        pole, ground = _rows(_pole_weights(vector)[0], h), _rows(_ground_weights(vector)[0], h)
+        spread, down = self._spread(pole, ground), ground[0]
         if self.ray is None:
-            return self.spread(vector)
-        down = ground_rows(vector)[0]
+            return spread
+        grazed = -2.0 * np.log(max(float(abs(down @ self.ray)), _LEAST_HEIGHT_M))
         if self.bumps is None:
-            grazed = 2.0 * np.log(max(float(abs(down @ self.ray)), _LEAST_HEIGHT_M))
-            return self.spread(vector) - self.balance * self.rough_m2 * float(grazed)
+            return spread + self.balance * self.rough_m2 * float(grazed)
         bumps_m2 = float(down @ self.bumps @ down)
-        height_m = float(abs(down @ self.ray))
         rough, _ = roughness(np.array(bumps_m2 / self.rough_m2))
-        grazed = float(rough) + 1.0 - 2.0 * np.log(max(height_m, _LEAST_HEIGHT_M))
-        return self.spread(vector) + self.balance * float(self.rough_m2 * grazed - bumps_m2)
+        return spread + self.balance * float(self.rough_m2 * (float(rough) + 1.0 + grazed) - bumps_m2)
 
     def slope(self, vector: Array) -> tuple[Array, Array]:
         """Give half the gradient (12,) of c, and what comes near half its Hessian (12, 12) about a minimum.
 
         That is Gauss's and Newton's; only on rough ground it need not be positive definite.
         """
-        pole, ground, steeper = self._half_slopes(vector)
-        gradient, hessian = ground
+        pole, (gradient, hessian), steeper = self._half_slopes(vector, bumps=True)
         if steeper is not None:
             gradient = gradient - self.rough_m2 * steeper
         if steeper is not None and self.bumps is not None:
-            h = _h(vector)
-            down = ground_rows(vector)[0]
-            weights = _ground_weights(vector)
-            bumps = _half_slope(self.bumps, *weights, h, _h_gradient(vector, h))
-            less = float(roughness(down @ self.bumps @ down / self.rough_m2)[1]) - 1.0
-            gradient = gradient + less * bumps[0]
-            hessian = hessian + less * bumps[1] - self.rough_m2 * np.outer(steeper, steeper)
+            hessian = hessian - self.rough_m2 * np.outer(steeper, steeper)
         return pole[0] + self.balance * gradient, pole[1] + self.balance * hessian
 
     def information(self, vector: Array) -> Array:
@@ -410,8 +405,7 @@ class Form:
 
         How steeply the beams meet rough ground is not told by how rough it looks.
         """
-        pole, ground, steeper = self._half_slopes(vector)
-        told = ground[1]
+        pole, (_, told), steeper = self._half_slopes(vector, bumps=False)
         if steeper is not None and self.bumps is not None:
             down = ground_rows(vector)[0]
             told = told - min(self.rough_m2, float(down @ self.bumps @ down)) * np.outer(steeper, steeper)
@@ -463,17 +457,24 @@ class Form:
             added += np.tensordot(weight @ of, bent, 1) + both + both.T
         return added
 
-    def _half_slopes(self, vector: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], Array | None]:
-        """Give `_half_slope` of both kinds, and on rough ground the derivative (12,) of ln of its height."""
+    def _half_slopes(
+        self, vector: Array, *, bumps: bool
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array], Array | None]:
+        """Give `_half_slope` of both kinds, and on rough ground the derivative (12,) of ln of its height.
+
+        With what its roughness adds to the ground's if ``bumps``.
+        """
         h = _h(vector)
         dh = _h_gradient(vector, h)
         weights, dweights = _ground_weights(vector)
-        steeper = None
+        down, ground, steeper = _rows(weights, h)[0], self.ground, None
         if self.ray is not None:
-            down = _jacobian(weights[0], dweights[0], h, dh)
-            steeper = self.ray @ down / (_rows(weights, h)[0] @ self.ray)
+            steeper = self.ray @ _jacobian(weights[0], dweights[0], h, dh) / (down @ self.ray)
+        if bumps and self.bumps is not None:
+            less = float(roughness(down @ self.bumps @ down / self.rough_m2)[1]) - 1.0
+            ground = ground + less * self.bumps
         pole = _half_slope(self.pole, *_pole_weights(vector), h, dh)
-        return pole, _half_slope(self.ground, weights, dweights, h, dh), steeper
+        return pole, _half_slope(ground, weights, dweights, h, dh), steeper
 
 
 def roughness(rough: Array) -> tuple[Array, Array]:
