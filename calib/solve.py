@@ -39,7 +39,7 @@ FLATTEST, ROUGHEST = 1e-6, 4.0
 
 _STEPS = 100
 _EASED, _DAMPED, _GIVE_UP = 0.1, 10.0, 1e9
-_NOTHING = 1e-15
+_NOTHING = 1e-13
 _STEP = 1e-5
 _DESCENTS = 40
 _AGAINST = -skew(np.eye(3))  # -[e]×
