@@ -29,20 +29,20 @@ class Now:
 
 
 class Running:
-    """Takes the scans of an open pass, of the same day as the last of the ``passes``.
+    """Takes the scans of an open pass, of ``site``: else of the same as the last of the ``passes``.
 
     What is held, and what passes weigh, stays as it was for the ``result``.
     """
 
     @one_thread
-    def __init__(self, passes: Sequence[Pass], setup: Setup, result: Result) -> None:
+    def __init__(self, passes: Sequence[Pass], setup: Setup, result: Result, site: int | None = None) -> None:
         used = [one for one in passes if one.id not in result.set_aside]
         held = {*result.held, *EXTRAS} - set(result.extras)
         self._free = np.array([name not in held for name in UNKNOWNS])
         self._result, self._radius_m = result, setup.pole_radius_m
         self._open = {kind: moments.zero() for kind in Kind}
         sites = [one.site for one in used]
-        self._site = sites[-1]
+        self._site = sites[-1] if site is None else site
         pole, ground = (
             scatter_of([one.totals[kind] for one in used], kind, self._radius_m, sites) for kind in Kind
         )

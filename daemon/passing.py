@@ -16,7 +16,8 @@ class Passing:
     It changes nothing: a pass counts once it is closed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, site: int) -> None:
+        self._site = site
         self._of: tuple[Result, OpenPass] | None = None
         self._running: Running | None = None
         self._parts, self._pole_returns = 0, 0
@@ -39,7 +40,7 @@ class Passing:
             return None
         longest = max(open_passes, key=lambda one: len(one.parts))
         if self._of is None or self._of[0] is not result or self._of[1] is not longest:
-            self._of, self._running = (result, longest), Running(passes, setup, result)
+            self._of, self._running = (result, longest), Running(passes, setup, result, self._site)
             self._parts = self._pole_returns = 0
         new = [returns for _, returns in longest.parts[self._parts :]]
         if new and self._running is not None:

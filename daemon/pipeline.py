@@ -69,7 +69,7 @@ class _LaserRun:
         """All that were closed, in their order, of the pole or of another reflector."""
         self.dropped: dict[int, Choice] = {}
         """Passes that the operator does not want, by id."""
-        self._passing, self._calibrated = Passing(), list[Pass]()
+        self._calibrated: list[Pass] = []
         self._config, self._laser = config, laser
         self._earlier_poles: set[tuple[int, int]] = set()
         self.anew(0, trajectory, gps_clock)
@@ -77,6 +77,7 @@ class _LaserRun:
     def anew(self, site: int, trajectory: Trajectory, gps_clock: Clock) -> None:
         """Begin to listen anew, on another day; what was learnt of the pole's place is of no use."""
         self._site = site
+        self._passing = Passing(site)
         self.pulse = Pulse()
         self.costs_m.clear()
         count = max((one.id for one in self.passes), default=0)

@@ -30,6 +30,20 @@ def test_scan_by_scan_the_estimate_comes_to_that_of_all_passes(rig, extras):
     assert abs(before.mount.x_m - whole.mount.x_m) > 1e-4
 
 
+def test_the_first_pass_of_another_day_is_not_held_against_the_pole_of_the_day_before(rig):
+    """The pole stands elsewhere in n on that day, which must not move what is found."""
+    returns = rig.drive(noise_m=0.01, nav_m=0.01, passes=12)
+    setup, last = Setup(rig.measured, extras=frozenset()), returns.pass_id == 11
+    passes = passes_of(returns[~last], 30)
+    before = estimate(passes, setup)
+    elsewhere = replace(returns[last], position_m=returns[last].position_m + np.array([3.0, -2.0, 1.0]))
+    apart, mistaken = (
+        Running(passes, setup, before, site).add(elsewhere).cost_m - before.cost_m for site in (1, None)
+    )
+    assert abs(apart) < 0.002
+    assert mistaken > 0.1
+
+
 def test_rough_ground_is_taken_off_scan_by_scan_too(rig):
     """To what the closed passes say of how rough it is."""
     rough = Rig(rig.true, passes=12, rough_m=0.03)
