@@ -113,7 +113,7 @@ def test_status_says_what_each_device_does(ended):
     assert (front["name"], front["kind"], front["port"]) == ("front", "sick_lms", str(bench.lms))
     assert (span["name"], span["kind"], span["port"]) == ("span", "novatel_span", str(bench.span))
     assert front["rate_hz"] == pytest.approx(18.8, rel=0.1)
-    assert span["rate_hz"] == pytest.approx(100.0, rel=0.1)
+    assert span["rate_hz"] == pytest.approx(100.0, rel=0.2)
     assert span["ins_status"] == "INS_SOLUTION_GOOD"
     assert front["reconnects"] == span["reconnects"] == 0
     assert front["identity"].startswith("LMS291")
