@@ -18,8 +18,16 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from polecal.calib.geometry import Array, rotation
-from polecal.calib.observations import PARAMETERS
-from polecal.calib.solve import CLEARLY, FLATTEST, ROUGHEST, Form, cost_m, ground_rows, roughness
+from polecal.calib.solve import (
+    CLEARLY,
+    FLATTEST,
+    ROUGHEST,
+    Form,
+    cost_m,
+    ground_rows,
+    roughness,
+    without_position,
+)
 
 _NOTHING_M = 1e-4
 _FAINTEST = 1e-9  # of its best told direction: where the position is told less, rounding says where it is
@@ -79,7 +87,7 @@ def certify(form: Form, vector: Array, held: Collection[str] = ()) -> Certificat
     known, equations, square = turned
     lowest = np.inf
     for part, more in parts:
-        reduced = _without_position(part, vector, held)
+        reduced = _eliminated(part, vector, held)
         if reduced is None:
             return _UNKNOWN
         q, rounding = reduced
@@ -108,16 +116,13 @@ def _chords(form: Form, at: float) -> list[tuple[Form, float]]:
     ]
 
 
-def _without_position(form: Form, vector: Array, held: Collection[str]) -> tuple[Array, float] | None:
+def _eliminated(form: Form, vector: Array, held: Collection[str]) -> tuple[Array, float] | None:
     """Give c with the best position for each [first column of Csb, second, 1], (7, 7), and how exact it is.
 
     None where the position that is not held is not told.
     """
     q = form.in_h(vector)
-    free = [6 + axis for axis in range(3) if PARAMETERS[axis] not in held]
-    known = np.zeros((10, 7))
-    known[:6, :6] = np.eye(6)
-    known[6:, 6] = [0.0 if 6 + axis in free else vector[axis] for axis in range(3)] + [1.0]
+    free, known = without_position(vector, held)
     whole, worse = known, 1.0
     if free:
         values = np.linalg.eigvalsh(q[np.ix_(free, free)])

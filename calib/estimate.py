@@ -340,6 +340,15 @@ def scatter_of(
     return Scatter(totals, shift_m=axis_shift_m(pole_radius_m), ranged=True, across_m=across_m, sites=sites)
 
 
+def scatters_of(passes: Sequence[Pass], pole_radius_m: float) -> tuple[Scatter, Scatter]:
+    """Give the scatters of passes' returns of the pole, and of the ground."""
+    sites = [one.site for one in passes]
+    pole, ground = (
+        scatter_of([one.totals[kind] for one in passes], kind, pole_radius_m, sites) for kind in Kind
+    )
+    return pole, ground
+
+
 @dataclass(frozen=True, slots=True)
 class _Found:
     """A minimum: the unknowns (12,), their covariance (12, 12), and which were held."""
@@ -360,11 +369,7 @@ class _Problem:
     """The passes of one laser, ready to be solved without some of them."""
 
     def __init__(self, passes: Sequence[Pass], setup: Setup) -> None:
-        sites = [one.site for one in passes]
-        self.pole, self.ground = (
-            scatter_of([one.totals[kind] for one in passes], kind, setup.pole_radius_m, sites)
-            for kind in Kind
-        )
+        self.pole, self.ground = scatters_of(passes, setup.pole_radius_m)
         self._passes, self._setup = passes, setup
         self._measured = np.concatenate([setup.measured.vector, np.zeros(len(EXTRAS))])
         self._measured_sigma = np.concatenate([setup.measured_sigma.vector, _TELLING])
@@ -505,7 +510,7 @@ class _Problem:
             extra_sigma={UNKNOWNS[index]: float(spread[index]) for index in told},
             cost_m=cost_m,
             measured_cost_m=solve.cost_m(paper, self._measured),
-            sigma=Mount(*(float(value) for value in (*sigma[:3], *np.degrees(sigma[3:])))),
+            sigma=Mount.of_variance(np.diag(covariance)),
             covariance=covariance,
             held=tuple(name for name in PARAMETERS if name in held),
             left_out_m=left_out_m,

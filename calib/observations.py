@@ -46,6 +46,12 @@ class Mount:
         degrees = (np.degrees(vector[3:]) + 180.0) % 360.0 - 180.0
         return cls(*(float(value) for value in (*vector[:3], *degrees)))
 
+    @classmethod
+    def of_variance(cls, variance: Array) -> Self:
+        """Take the roots of variances (6,), m² and rad²: σ of a mount."""
+        sigma = np.sqrt(variance)
+        return cls(*(float(value) for value in (*sigma[:3], *np.degrees(sigma[3:]))))
+
     @property
     def vector(self) -> Array:
         """(6,) x, y, z in m and roll, pitch, yaw in rad."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from polecal.calib import moments
 from polecal.calib.blas import one_thread
-from polecal.calib.estimate import Pass, Result, Setup, scatter_of
+from polecal.calib.estimate import Pass, Result, Setup, scatters_of
 from polecal.calib.observations import Kind, Mount, Returns
 from polecal.calib.solve import EXTRAS, UNKNOWNS, Form
 from polecal.calib.subsets import Subsets
@@ -41,11 +41,8 @@ class Running:
         self._free = np.array([name not in held for name in UNKNOWNS])
         self._result, self._radius_m = result, setup.pole_radius_m
         self._open = {kind: moments.zero() for kind in Kind}
-        sites = [one.site for one in used]
-        self._site = sites[-1] if site is None else site
-        pole, ground = (
-            scatter_of([one.totals[kind] for one in used], kind, self._radius_m, sites) for kind in Kind
-        )
+        self._site = used[-1].site if site is None else site
+        pole, ground = scatters_of(used, self._radius_m)
         self._bend = Form.of(pole, ground, np.ones(len(used), dtype=bool), result.weights).bend(result.vector)
         self._closed = Subsets.near(pole, ground, result.weights, result.vector, self._free)
         self._all, self._untold = self._closed, np.zeros((6, 6))
@@ -66,8 +63,8 @@ class Running:
                 timed=bool(self._free[UNKNOWNS.index("time_s")]),
             )
             self._open[kind] = sum(blocks.values(), before)
-        pole, ground = (scatter_of([self._open[kind]], kind, self._radius_m, [self._site]) for kind in Kind)
-        self._all = self._closed.with_more(pole, ground)
+        open_pass = Pass(0, self._open, {}, self._site)
+        self._all = self._closed.with_more(*scatters_of([open_pass], self._radius_m))
         (minimum,) = self._all.minima(np.ones((1, len(self._all)), dtype=bool), self._bend)
         return Now(Mount.from_vector(minimum[:6]), self._all.cost_m(minimum))
 
@@ -81,5 +78,4 @@ class Running:
             + jackknife(self._all.minima(~np.eye(len(self._all), dtype=bool), self._bend))[:6, :6]
         )
         variance = np.where(self._free[:6], np.diag(told), np.diag(self._result.covariance))
-        sigma = np.sqrt(np.maximum(0.0, variance))
-        return Mount(*sigma[:3].tolist(), *np.degrees(sigma[3:]).tolist())
+        return Mount.of_variance(np.maximum(0.0, variance))

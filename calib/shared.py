@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polecal.calib.estimate import Pass, Result, Setup, Shared, scatter_of
+from polecal.calib.estimate import Pass, Result, Setup, Shared, scatters_of
 from polecal.calib.geometry import Array, rotation, rotation_gradient, skew, wrap
-from polecal.calib.observations import PARAMETERS, Kind, Mount
+from polecal.calib.observations import PARAMETERS, Mount
 from polecal.calib.solve import Form, cost_m
 from polecal.calib.student import exceeded
 
@@ -153,15 +153,10 @@ def _result(taker: Witness, shared: Shared, change: Array, covariance: Array) ->
         covariance=old.covariance + covariance,
         shared=shared,
     )
-    sigma = np.sqrt(np.diag(moved.covariance))
     used = [one for one in taker.passes if one.id not in old.set_aside]
-    sites = [one.site for one in used]
-    pole, ground = (
-        scatter_of([one.totals[kind] for one in used], kind, taker.setup.pole_radius_m, sites)
-        for kind in Kind
-    )
+    pole, ground = scatters_of(used, taker.setup.pole_radius_m)
     return replace(
         moved,
-        sigma=Mount(*(float(value) for value in (*sigma[:3], *np.degrees(sigma[3:])))),
+        sigma=Mount.of_variance(np.diag(moved.covariance)),
         cost_m=cost_m(Form.of(pole, ground, np.ones(len(used), dtype=bool)), moved.vector),
     )

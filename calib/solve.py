@@ -128,13 +128,6 @@ class Scatter:
         ray[self._features] = mean * np.tile(_RAY, 3)[self._features]
         return ray
 
-    def weighted_mean(self, used: NDArray[np.bool_], ratio: float = np.inf) -> tuple[float, Array]:
-        """Give what the used passes weigh together, and their mean (108,) so weighed."""
-        weight = self.weight(ratio)[used]
-        total, mean = float(weight.sum()), np.zeros(3 * WIDTH)
-        mean[self._features] = weight / max(total, 1e-300) @ self._mean[used]
-        return total, mean
-
     def weight(self, ratio: float = np.inf) -> Array:
         """Give what each pass's mean weighs, (P,), in returns: see `form`."""
         weight: Array = self.count / (1.0 + self.count / ratio)
@@ -588,6 +581,18 @@ def minimise_globally(form: Form, start: Array, held: Collection[str] = ()) -> A
     return lowest
 
 
+def without_position(vector: Array, held: Collection[str]) -> tuple[list[int], Array]:
+    """Give which of h (10,) are of a position that is sought, and the rest of h of [two columns, 1], (10, 7).
+
+    What is held of it is as in ``vector`` (12,).
+    """
+    free = [6 + axis for axis in range(3) if UNKNOWNS[axis] not in held]
+    known = np.zeros((10, 7))
+    known[:6, :6] = np.eye(6)
+    known[6:, 6] = [0.0 if 6 + axis in free else vector[axis] for axis in range(3)] + [1.0]
+    return free, known
+
+
 def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
     """Descend from many rotations at once, the extras as in ``start``; give the lowest end, (12,).
 
@@ -595,10 +600,7 @@ def _lowest_rotation(form: Form, start: Array, held: Collection[str]) -> Array:
     way on SO(3), damped, R exp([δ]×), for all rotations in one array.
     """
     q = form.in_h(start)
-    free = [6 + axis for axis in range(3) if UNKNOWNS[axis] not in held]
-    known = np.zeros((10, 7))
-    known[:6, :6] = np.eye(6)
-    known[6:, 6] = [0.0 if 6 + axis in free else start[axis] for axis in range(3)] + [1.0]
+    free, known = without_position(start, held)
     to_position = -np.linalg.pinv(q[np.ix_(free, free)], rcond=1e-9, hermitian=True) @ q[free] @ known
     whole = known.copy()
     whole[free] += to_position

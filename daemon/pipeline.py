@@ -99,10 +99,14 @@ class _LaserRun:
         if self.result is not None:
             self.costs_m.append(round(self.result.cost_m, 5))
 
+    def counted(self) -> list[Kept]:
+        """Give the passes of the pole, less what was dropped."""
+        poles = self.poles()
+        return [one for one in self.passes if one.where in poles and one.id not in self.dropped]
+
     def estimate(self, *, everywhere: bool) -> None:
         """Calibrate on the passes of the pole, less what was dropped."""
-        poles = self.poles()
-        kept = [one for one in self.passes if one.where in poles and one.id not in self.dropped]
+        kept = self.counted()
         passes = [one.moments for one in kept]
         self._calibrated = passes
         self.alone = self.result = self.view = self.witness = None
@@ -329,8 +333,7 @@ class Pipeline:
         """Give what a route depends on."""
         lasers = []
         for laser in self._lasers.values():
-            poles = laser.poles()
-            kept = [one for one in laser.passes if one.where in poles and one.id not in laser.dropped]
+            kept = laser.counted()
             today = [one.moments for one in kept if one.moments.site == self._site]
             passes = [one.moments for one in kept]
             lasers.append(LaserStand(laser.name, laser.setup, laser.result, passes, today))

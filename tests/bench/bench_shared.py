@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from polecal.calib import PARAMETERS, Criteria, Kind, Mount, Need, Setup, estimate
-from polecal.calib.estimate import passes_of, scatter_of
+from polecal.calib import PARAMETERS, Criteria, Mount, Need, Setup, estimate
+from polecal.calib.estimate import passes_of, scatters_of
 from polecal.calib.report.rig import Rig, drives
 from polecal.calib.shared import Witness, share
 from polecal.calib.solve import EXTRAS, Form, minimise
@@ -108,7 +108,7 @@ def place_known(turn: int, seed: int) -> np.ndarray:
     (returns,) = drives(RIG, [RIG.mount], seed, 200 * PASSES, 400 * PASSES)
     passes = passes_of(returns, 30)[: PASSES * turn // 360]
     used = np.ones(len(passes), dtype=bool)
-    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.04) for kind in Kind)
+    pole, ground = scatters_of(passes, 0.04)
     start = np.concatenate([RIG.mount.vector, np.zeros(len(EXTRAS))])
     form = Form(pole.form(used, 1.0), ground.form(used, 1.0))
     total, mean = pole.weighted_mean(used, 1.0)  # from n's origin, where the pole is

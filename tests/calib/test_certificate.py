@@ -6,9 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from polecal.calib import Mount, Setup, estimate
 from polecal.calib.certificate import _chords, certify
-from polecal.calib.estimate import passes_of, scatter_of
+from polecal.calib.estimate import passes_of, scatters_of
 from polecal.calib.geometry import roll_pitch_yaw
-from polecal.calib.observations import Kind
 from polecal.calib.report.rig import Rig, drive
 from polecal.calib.solve import EXTRAS, Form, Weights, cost_m, ground_rows, minimise, minimise_globally
 
@@ -24,7 +23,7 @@ def passes():
 
 def form_of(passes, *, sought=True):
     """Of rough ground: how rough it is is sought, or known."""
-    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.04) for kind in Kind)
+    pole, ground = scatters_of(passes, 0.04)
     used = np.ones(len(passes), dtype=bool)
     weights = Weights.told(pole, ground, used, START, pass_error=True, rough=True, by_kind=True)
     form = Form.of(pole, ground, used, weights)
@@ -121,7 +120,7 @@ def test_numbers_of_whatever_size_give_a_bound_or_none_but_no_error(passes, scal
 
 def test_a_perfect_fit_is_the_lowest(rig):
     passes = passes_of(rig.drive(), 30)
-    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.0) for kind in Kind)
+    pole, ground = scatters_of(passes, 0.0)
     every = np.ones(len(passes), dtype=bool)
     form = Form(pole.form(every), ground.form(every))
     found = minimise_globally(form, START, EXTRAS)

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from polecal.calib.estimate import passes_of, scatter_of
+from polecal.calib.estimate import passes_of, scatters_of
 from polecal.calib.geometry import wrap
-from polecal.calib.observations import Kind
 from polecal.calib.solve import EXTRAS, Form, minimise, minimise_globally, roughness
 
 EVERY = np.ones(12, dtype=bool)
@@ -13,7 +12,7 @@ ROUGH_M2 = 0.03**2
 @pytest.fixture(scope="module")
 def form(rig):
     passes = passes_of(rig.drive(passes=12, noise_m=0.01, nav_m=0.01, radius_m=0.04), 30)
-    pole, ground = (scatter_of([one.totals[kind] for one in passes], kind, 0.04) for kind in Kind)
+    pole, ground = scatters_of(passes, 0.04)
     return Form(pole.form(EVERY, 3.0), ground.form(EVERY, 50.0), ROUGH_M2, ground.ray(EVERY))
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from polecal.calib import Setup, estimate, solve
-from polecal.calib.estimate import passes_of, scatter_of
+from polecal.calib.estimate import passes_of, scatters_of
 from polecal.calib.geometry import wrap
 from polecal.calib.observations import Kind
 from polecal.calib.report.rig import Rig, drive
@@ -10,10 +10,6 @@ from polecal.calib.solve import EXTRAS, UNKNOWNS, Form, Weights
 from polecal.calib.subsets import Subsets
 
 P = 12
-
-
-def scatters_of(passes):
-    return [scatter_of([one.totals[kind] for one in passes], kind, 0.04) for kind in Kind]
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +21,7 @@ def passes(rig):
 @pytest.fixture(scope="module", params=["eq7", "as told", "by kind"])
 def problem(request, rig, passes):
     """Scatters, weights, the minimum of all, what is held and free, and the form."""
-    pole, ground = scatters_of(passes)
+    pole, ground = scatters_of(passes, 0.04)
     every, held = np.ones(P, dtype=bool), {"lean_north", "lean_east"}
     start = np.concatenate([rig.measured.vector, np.zeros(len(EXTRAS))])
     about = solve.minimise(Form.of(pole, ground, every), start, held)
@@ -90,7 +86,7 @@ def test_how_rows_bend_makes_half_the_hessian_whole(problem):
 def test_a_pass_that_comes_later_counts_as_if_it_had_been_there(problem, passes):
     *scatters, weights, vector, _, free, form = problem
     whole = Subsets.near(*scatters, weights, vector, free)
-    early, late = (scatters_of(some) for some in (passes[:-1], passes[-1:]))
+    early, late = (scatters_of(some, 0.04) for some in (passes[:-1], passes[-1:]))
     before = Subsets.near(*early, weights, vector, free)
     subsets = ~np.eye(P + 1, P, -1, dtype=bool)
     one, other = (of.minima(subsets, form.bend(vector)) for of in (before.with_more(*late), whole))
