@@ -17,9 +17,9 @@ add and subtract.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -44,13 +44,13 @@ class Moments:
     """Sums over returns of one kind: how many, Σ f (K,) and Σ f fᵀ, f in m, axis by axis of n.
 
     ``features`` (K,) says which of the 108 were summed up, in order; of the others nothing is known.
-    Σ f fᵀ is symmetric: ``packed`` (K (K + 1) / 2,) is its upper triangle, row by row.
+    ``held`` is what `packed` gives, or, where that is kept elsewhere, a function that fetches it.
     """
 
     count: int
     features: NDArray[np.int64]
     first: Array
-    packed: Array
+    held: Array | Callable[[], Array]
 
     def __add__(self, other: Moments) -> Moments:
         return self._with(other, 1)
@@ -62,7 +62,7 @@ class Moments:
         one, two = self, other
         if not np.array_equal(one.features, two.features):
             both = np.union1d(one.features, two.features)
-            one, two = one._over(both), two._over(both)
+            one, two = one.over(both), two.over(both)
         return Moments(
             one.count + sign * two.count,
             one.features,
@@ -70,18 +70,29 @@ class Moments:
             one.packed + sign * two.packed,
         )
 
-    def _over(self, features: NDArray[np.int64]) -> Moments:
+    def over(self, features: NDArray[np.int64]) -> Moments:
         """Give the same, of more features: the sums of those that were left out are 0."""
-        first = np.zeros(len(features))
-        second = np.zeros((len(features), len(features)))
+        if features is self.features or np.array_equal(features, self.features):
+            return self
         there = np.searchsorted(features, self.features)
-        first[there], second[np.ix_(there, there)] = self.first, self.second
-        return of_sums(self.count, features, first, second)
+        first = np.zeros(len(features))
+        first[there] = self.first
+        return Moments(self.count, features, first, partial(self._packed_over, len(features), there))
+
+    def _packed_over(self, width: int, there: NDArray[np.int64]) -> Array:
+        packed = np.zeros(width * (width + 1) // 2)
+        packed[unpacked(width)[np.ix_(there, there)].ravel()[upper(len(there))]] = self.packed
+        return packed
+
+    @property
+    def packed(self) -> Array:
+        """Σ f fᵀ, which is symmetric: its upper triangle, row by row, (K (K + 1) / 2,)."""
+        return self.held() if callable(self.held) else self.held
 
     @property
     def second(self) -> Array:
         """Σ f fᵀ, (K, K)."""
-        return self.packed[_unpacked(len(self.features))]
+        return self.packed[unpacked(len(self.features))]
 
     def mean(self) -> Array:
         """Give the mean (3, 36) of the features, m; 0 of those that were left out."""
@@ -97,29 +108,27 @@ def zero() -> Moments:
 
 def of_sums(count: int, features: NDArray[np.int64], first: Array, second: Array) -> Moments:
     """Pack sums over so many returns: of features (K,), (K,) and (K, K)."""
-    return Moments(count, features, first, second.ravel()[_upper(len(features))])
+    return Moments(count, features, first, second.ravel()[upper(len(features))])
 
 
-def stacked(parts: Sequence[Moments]) -> tuple[NDArray[np.int64], Array, Array]:
-    """Give the features (K,) that any of P parts has, and the parts' sums, (P, K) and (P, K, K)."""
+def alike(parts: Sequence[Moments]) -> list[Moments]:
+    """Give parts each over the features that any of them has."""
     features = parts[0].features if parts else zero().features
     for part in parts:
-        if not np.array_equal(part.features, features):
+        if part.features is not features and not np.array_equal(part.features, features):
             features = np.union1d(features, part.features)
-    alike = [part if np.array_equal(part.features, features) else part._over(features) for part in parts]
-    first = np.stack([part.first for part in alike])
-    return features, first, np.stack([part.packed for part in alike])[:, _unpacked(len(features))]
+    return [part.over(features) for part in parts]
 
 
 @cache
-def _upper(width: int) -> NDArray[np.int64]:
+def upper(width: int) -> NDArray[np.int64]:
     """Give where the upper triangle is in a matrix (K, K), flat."""
     row, column = np.triu_indices(width)
     return row * width + column
 
 
 @cache
-def _unpacked(width: int) -> NDArray[np.int64]:
+def unpacked(width: int) -> NDArray[np.int64]:
     """Give where each entry (K, K) of a symmetric matrix is in its packed upper triangle."""
     row, column = np.indices((width, width))
     low, high = np.minimum(row, column), np.maximum(row, column)

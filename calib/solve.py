@@ -23,7 +23,7 @@ from polecal.calib.geometry import (
     skew,
     turning,
 )
-from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments, stacked
+from polecal.calib.moments import BASE, RANGE, TIME, TIME_SQUARED, WIDTH, Moments, alike, unpacked, upper
 from polecal.calib.observations import PARAMETERS
 
 EXTRAS = ("time_s", "range_m", "lean_north", "lean_east", "slope_north", "slope_east")
@@ -48,6 +48,7 @@ _SETTLED, _SETTLED_TURNS = (
     3,
 )  # of c; where at its pace no descent gets that much below the lowest any more
 _LEAST_HEIGHT_M = 1e-3  # of a sensor above its ground
+_AT_ONCE = 16  # passes whose sums are looked at as matrices: of hundreds they would be most of the memory
 _LEAST_M2 = 1e-6  # of a return's own variance: no laser is as good as 1 mm
 
 
@@ -75,22 +76,46 @@ class Scatter:
         sites: Sequence[int] | None = None,
     ) -> None:
         self.count = np.array([one.count for one in passes], dtype=np.float64)
-        features, first, second = stacked(passes)
-        per_return = 1.0 / np.maximum(1.0, self.count)
-        mean = first * per_return[:, None]
-        within = second - first[:, :, None] * mean[:, None]
-        self._aside = across_m**2 * _aside(features, second, per_return) if across_m else None
-        along = np.flatnonzero(_of_range(features))
-        if shift_m and len(along):
-            moved = np.searchsorted(features, features[along] - RANGE.start)
-            for sums in (mean, within.swapaxes(1, 2), within):  # views
-                sums[..., moved] += shift_m * sums[..., along]
-        if len(along) and not ranged:
-            kept = np.delete(np.arange(len(features)), along)
-            features, mean, within = features[kept], mean[:, kept], within[:, kept[:, None], kept]
-            self._aside = None if self._aside is None else self._aside[:, kept[:, None], kept]
-        self._features, self._mean, self._within = features, mean, within
         self.sites = np.zeros(len(passes), dtype=np.int64) if sites is None else np.array(sites)
+        self._passes = alike(passes)
+        features = self._passes[0].features
+        along = np.flatnonzero(_of_range(features))
+        moved = np.searchsorted(features, features[along] - RANGE.start)
+        self._along, self._moved, self._shift_m = along, moved, shift_m
+        self._aside = _aside(self._passes, along, moved, across_m) if across_m and ranged else None
+        self._kept = np.arange(len(features)) if ranged else np.delete(np.arange(len(features)), along)
+        self._features = features[self._kept]
+        self._summed: tuple[bytes, Array] | None = None
+        first = np.stack([one.first for one in self._passes])
+        self._mean = self._shifted(first / np.maximum(1.0, self.count)[:, None])[:, self._kept]
+
+    def _shifted(self, sums: Array) -> Array:
+        """Give what sums (…, K) of all features are where every range is longer by what is known of it."""
+        if self._shift_m:
+            sums[..., self._moved] += self._shift_m * sums[..., self._along]
+        return sums
+
+    def _rows(self, kept: Array) -> Array:
+        """Give rows (K, …) for features as they were summed up that do what ``kept`` do for those here."""
+        rows = np.zeros((len(self._passes[0].features), *kept.shape[1:]))
+        rows[self._kept] = kept
+        if self._shift_m:
+            rows[self._along] += self._shift_m * rows[self._moved]
+        return rows
+
+    def _within(self, used: NDArray[np.bool_]) -> Array:
+        """Give Σ over used passes of what their features spread within each, (K, K)."""
+        if self._summed is None or self._summed[0] != used.tobytes():
+            numbers, width = np.flatnonzero(used), len(self._passes[0].features)
+            second, first = np.zeros(width * (width + 1) // 2), np.zeros((len(numbers), width))
+            for row, number in zip(first, numbers.tolist(), strict=True):
+                second += self._passes[number].packed
+                row[:] = self._passes[number].first
+            mean = first / np.maximum(1.0, self.count[used])[:, None]
+            within = second[unpacked(width)] - first.T @ mean
+            within = self._shifted(self._shifted(within).T)
+            self._summed = used.tobytes(), within[np.ix_(self._kept, self._kept)]
+        return self._summed[1]
 
     def form(self, used: NDArray[np.bool_], ratio: float = np.inf) -> Array:
         """Give the covariance (108, 108) of the used passes' features, m².
@@ -106,14 +131,16 @@ class Scatter:
         apart = self._mean[used]
         for site in _each(self.sites[used]):
             apart[site] -= weight[site] / (weight[site].sum() or 1.0) @ apart[site]
-        within = self._within[used].sum(axis=0)
+        summed = self._within(used) + (weight[:, None] * apart).T @ apart
         if self._aside is not None and np.isfinite(ratio):
-            within -= self._aside[used].sum(axis=0)
-        return self._whole((within + (weight[:, None] * apart).T @ apart) / total)
+            aside = self._aside[used].sum(axis=0)
+            summed[np.ix_(self._moved, self._along)] -= aside
+            summed[np.ix_(self._along, self._moved)] -= aside
+        return self._whole(summed / total)
 
     def within_form(self, used: NDArray[np.bool_]) -> Array:
         """Give the part (108, 108) of `form` that is within the used passes, m²."""
-        return self._whole(self._within[used].sum(axis=0) / max(1.0, self.count[used].sum()))
+        return self._whole(self._within(used) / max(1.0, self.count[used].sum()))
 
     def _whole(self, matrix: Array) -> Array:
         """Give a matrix (K, K) of the features that there are as one of all, (108, 108)."""
@@ -136,18 +163,33 @@ class Scatter:
     def along(self, basis: Array, ratio: float) -> Along:
         """Give these sums along rows (A, 108, M) of A axes: all that is to be known of their mixtures."""
         there = np.ascontiguousarray(basis[:, self._features].swapaxes(0, 1))  # (K, A, M)
-        within = taken = _squares(self._within, there)
+        mean = np.tensordot(self._mean, there, 1)
+        within = self._squares(self._rows(there))
+        within -= (self.count[:, None, None] * mean.swapaxes(1, 2)) @ mean
+        taken = within
         if self._aside is not None and np.isfinite(ratio):
-            taken = within - _squares(self._aside, there)
+            aside = _squares(self._aside, there[self._along], there[self._moved])
+            taken = within - aside - aside.swapaxes(1, 2)
         return Along(
             self.count,
             self.weight(ratio),
             self.sites,
-            np.tensordot(self._mean, there, 1),
+            mean,
             within,
             taken,
             (self._mean * np.tile(_RAY, 3)[self._features]) @ there[:, 0],
         )
+
+    def _squares(self, rows: Array) -> Array:
+        """Give Σ over axes of rowsᵀ Σ f fᵀ rows of each pass, (P, M, M), of (K, A, M); few at a time."""
+        width, squares = len(rows), []
+        second = np.empty((min(_AT_ONCE, len(self._passes)), width, width))
+        for start in range(0, len(self._passes), _AT_ONCE):
+            some = self._passes[start : start + _AT_ONCE]
+            for one, of in zip(some, second, strict=False):
+                np.take(one.packed, unpacked(width), out=of, mode="clip")  # several times as fast as "raise"
+            squares.append(_squares(second[: len(some)], rows, rows))
+        return np.concatenate(squares)
 
     def means(self, rows: Array) -> Array:
         """Give each pass's mean (P, k) in the given rows (k, 108): `_rows` of a vector."""
@@ -164,15 +206,20 @@ class Scatter:
 
     def within(self, rows: Array) -> Array:
         """Give each pass's variance within, (P,), m², the mean over the given rows (k, 108)."""
-        there = rows[:, self._features]
-        summed = ((self._within @ there.T) * there.T).sum(axis=(1, 2))
+        there = self._rows(rows[:, self._features].T)
+        square = (2.0 * (there @ there.T)).ravel()
+        square[:: len(there) + 1] /= 2.0
+        packed = square[upper(len(there))]
+        summed = np.array([one.packed @ packed for one in self._passes])
+        summed -= self.count * (self.means(rows) ** 2).sum(axis=1)
         within: Array = np.maximum(0.0, summed) / np.maximum(1.0, self.count) / len(rows)
         return within
 
     def mean_within(self, rows: Array, used: NDArray[np.bool_]) -> float:
         """Give `within` of the used passes together, each counted by its returns, m²."""
-        count = self.count[used]
-        return float(count @ self.within(rows)[used] / max(1.0, count.sum()))
+        there = rows[:, self._features]
+        summed = float((there @ self._within(used) * there).sum())
+        return max(0.0, summed) / max(1.0, float(self.count[used].sum())) / len(rows)
 
     def ratio(self, rows: Array, used: NDArray[np.bool_]) -> float:
         """Estimate `form`'s ratio from the used passes themselves."""
@@ -222,12 +269,12 @@ class Along:
         )
 
 
-def _squares(matrices: Array, rows: Array) -> Array:
-    """Give Σ over axes of rowsᵀ M rows, (P, M, M), of (P, K, K) and (K, A, M)."""
+def _squares(matrices: Array, rows: Array, others: Array) -> Array:
+    """Give Σ over axes of othersᵀ M rows, (P, M, M), of (P, K, K) and (K, A, M) twice."""
     passes, width = len(matrices), len(rows)
     flat = rows.reshape(width, rows.shape[1] * rows.shape[2])
     pulled = (matrices.reshape(passes * width, width) @ flat).reshape(passes, *rows.shape)
-    squares: Array = np.sum([rows[:, axis].T @ pulled[:, :, axis] for axis in range(rows.shape[1])], axis=0)
+    squares: Array = np.sum([others[:, axis].T @ pulled[:, :, axis] for axis in range(rows.shape[1])], axis=0)
     return squares
 
 
@@ -242,30 +289,31 @@ def _of_range(features: NDArray[np.int64]) -> NDArray[np.bool_]:
     return of
 
 
-def _aside(features: NDArray[np.int64], second: Array, per_return: Array) -> Array:
-    """Give what returns 1 m to the side of their mark add to P passes' Σ f fᵀ, (P, K, K), per m².
+def _aside(
+    passes: Sequence[Moments], along: NDArray[np.int64], moved: NDArray[np.int64], across_m: float
+) -> Array | None:
+    """Give what returns ``across_m`` to the side of their mark, σ, add to P passes' Σ f fᵀ, (P, 18, 18).
 
-    A return m to the side is at a bearing m / r off. A range offset b moves it along its own beam, not its
-    mark's, and so makes the spread (1 + b / r)² as wide: too short ranges look good. That it does is no
-    news of b. 1 / r on average is told by the means of r and r², as if ln r were normal. All of that takes
-    all three axes.
+    It is added between the features ``along`` the beam and those which they move, both ways. A return m to
+    the side is at a bearing m / r off. A range offset b moves it along its own beam, not its mark's, and so
+    makes the spread (1 + b / r)² as wide: too short ranges look good. That it does is no news of b. 1 / r on
+    average is told by the means of r and r², as if ln r were normal. All of that takes all three axes; None
+    where there are fewer.
     """
-    added = np.zeros_like(second)
-    along = np.flatnonzero(_of_range(features))
     if len(along) != 3 * 6:
-        return added
-    moved = np.searchsorted(features, features[along] - RANGE.start)
+        return None
+    where = unpacked(len(passes[0].features))
+    wanted = np.concatenate([where[np.ix_(along, along)].ravel(), where[moved, along], where[moved, moved]])
+    picked = np.stack([one.packed[wanted] for one in passes])
     # The axis of n, [x or y], the axis of b: of [cos θ C | sin θ C] to [-sin θ C | cos θ C], but for signs.
-    across = second[:, along[:, None], along].reshape(-1, 3, 2, 3, 3, 2, 3)[:, :, ::-1, :, :, ::-1].copy()
+    across = picked[:, : 18 * 18].reshape(-1, 3, 2, 3, 3, 2, 3)[:, :, ::-1, :, :, ::-1].copy()
     across[:, :, 0, :, :, 1] *= -1.0
     across[:, :, 1, :, :, 0] *= -1.0
     # Each of the three axes of C is of length 1.
-    r_m = second[:, moved, along].sum(axis=1) * per_return / 3
-    r_m2 = second[:, moved, moved].sum(axis=1) * per_return / 3
+    returns = np.maximum(1.0, np.array([one.count for one in passes]))
+    r_m, r_m2 = (picked[:, -36:-18].sum(axis=1) / returns / 3, picked[:, -18:].sum(axis=1) / returns / 3)
     per_m = np.divide(r_m2, r_m**3, out=np.zeros_like(r_m), where=r_m > 0)
-    both = per_m[:, None, None] * across.reshape(-1, 18, 18)
-    added[:, moved[:, None], along] = both
-    added[:, along[:, None], moved] = both
+    added: Array = across_m**2 * per_m[:, None, None] * across.reshape(-1, 18, 18)
     return added
 
 

@@ -137,7 +137,7 @@ class Subsets:
             off = np.einsum("pam,pm->pa", along.mean - mean, rows) * (weighed > 0)[:, None]
             squares = np.einsum("pi,pij,pj->p", rows, along.within, rows) + along.count * (off**2).sum(axis=1)
             total += float(squares[used].sum()) / max(1.0, float(along.count[used].sum()))
-        return float(np.sqrt(total))
+        return float(np.sqrt(max(0.0, total)))  # of passes of one return each rounding is all there is
 
 
 class _Cost:

@@ -88,10 +88,10 @@ def test_moments_of_unlike_features_add_up_as_if_what_is_missing_were_nothing(re
     assert both.count == 2 * len(returns)
     np.testing.assert_array_equal(both.mean()[m.DOWN], low.mean()[m.DOWN] / 2)
     assert np.array_equal((both - low).second[:20, :20], flat.second)
-    features, first, second = m.stacked([low, flat, m.zero()])
-    assert np.array_equal(features, both.features)
-    np.testing.assert_array_equal(first.sum(axis=0), both.first)
-    np.testing.assert_array_equal(second.sum(axis=0), both.second)
+    alike = m.alike([low, flat, m.zero()])
+    assert all(np.array_equal(one.features, both.features) for one in alike)
+    np.testing.assert_array_equal(sum(one.first for one in alike), both.first)
+    np.testing.assert_array_equal(sum(one.second for one in alike), both.second)
 
 
 def test_a_time_offset_moves_every_return_along_the_bodys_motion(returns, rig):

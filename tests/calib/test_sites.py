@@ -76,8 +76,8 @@ def test_of_one_day_nothing_changes(rig, driven, setup):
         mean = scatter._mean[used]
         apart = mean - weight / weight.sum() @ mean
         total = scatter.count[used].sum()
-        form = (scatter._within[used].sum(axis=0) + (weight[:, None] * apart).T @ apart) / total
         there = np.ix_(scatter._features, scatter._features)
+        form = scatter.within_form(used)[there] + (weight[:, None] * apart).T @ apart / total
         np.testing.assert_allclose(scatter.form(used, ratio)[there], form, rtol=1e-12, atol=1e-12)
         count = scatter.count[used]
         within = float((count * scatter.within(rows)[used]).sum() / count.sum())
