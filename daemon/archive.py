@@ -31,6 +31,7 @@ from polecal.daemon.recorder import Event, RecorderError
 from polecal.daemon.replay import BEGIN, CHOICE
 from polecal.daemon.routine import State
 from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, Session, SessionError, captures_of, folders
+from polecal.daemon.spill import Spill
 
 _OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "page", "port")
 """Keys of the configuration that may change from day to day."""
@@ -54,7 +55,7 @@ def reopen(folder: Path) -> tuple[Session, Pipeline]:
     """Give a session that is over, and a pipeline that stands where it ended. Raises SessionError."""
     metadata, config = told(folder)
     session = Session(folder, metadata["created"], len(captures_of(folder)))
-    pipeline = Pipeline(config, session=session.id, created=session.created)
+    pipeline = Pipeline(config, session=session.id, created=session.created, folder=folder)
     pipeline.reopen(past_of(folder), time.monotonic_ns())
     return session, pipeline
 
@@ -97,8 +98,9 @@ def past_of(folder: Path) -> Past:
     if not captures:
         raise SessionError(f"{folder}: has no capture", "bring its capture.mcap back")
     passes: dict[str, list[Kept]] = {}
+    spill = Spill(folder)
     for path in sorted((folder / "passes").glob("*.npz"), key=lambda each: (len(each.name), each.name)):
-        passes.setdefault(path.stem.rpartition("-")[0], []).append(read_pass(path))
+        passes.setdefault(path.stem.rpartition("-")[0], []).append(read_pass(path).spilled(spill))
     every = {name: sorted({one.where for one in kept}) for name, kept in passes.items()}
     content = calibration(folder)
     if content is not None and content.get("captures", 1) == len(captures):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from polecal.calib.segment import even_ground
 from polecal.daemon import facts
 from polecal.daemon.facts import Facts
 from polecal.daemon.quality import Quality
+from polecal.daemon.spill import Spill
 from polecal.daemon.trajectory import Poses
 
 _OUT_OF_VIEW_NS = 1_500_000_000
@@ -39,6 +40,14 @@ class Kept:
     def where(self) -> tuple[int, int]:
         """Which reflector it is of: site and place."""
         return self.moments.site, self.place
+
+    def spilled(self, spill: Spill) -> Kept:
+        """Give the same pass, its sums kept by ``spill``, if they are not yet by any."""
+        totals = {
+            kind: of if callable(of.held) else replace(of, held=spill.put(of.held))
+            for kind, of in self.moments.totals.items()
+        }
+        return replace(self, moments=replace(self.moments, totals=totals))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from polecal.daemon.past import Past
 from polecal.daemon.pulse import Pulse
 from polecal.daemon.route import LaserStand, Place, Stand
 from polecal.daemon.routine import OnTransition, Routine, State
+from polecal.daemon.spill import Spill
 from polecal.daemon.trajectory import Trajectory
 from polecal.drivers.clock import Clock
 from polecal.drivers.sick_lms import Decoded
@@ -54,9 +56,12 @@ class _LaserRun:
         laser: Laser,
         trajectory: Trajectory,
         gps_clock: Clock,
+        *,
         on_scan: OnScan | None,
+        spill: Spill,
     ) -> None:
         self.name = laser.name
+        self._spill = spill
         self.setup = results.setup_of(config, laser)
         self._on_scan = partial(on_scan, laser.name) if on_scan is not None else None
         self.result: Result | None = None
@@ -90,11 +95,11 @@ class _LaserRun:
 
     def remember(self, passes: Iterable[Kept], poles: Collection[tuple[int, int]]) -> None:
         """Take passes of earlier days, and which (site, place) of theirs could be the pole."""
-        self.passes = list(passes)
+        self.passes = [one.spilled(self._spill) for one in passes]
         self._earlier_poles = set(poles)
 
     def take(self, stored: StoredPass) -> None:
-        self.passes.append(stored.kept)
+        self.passes.append(stored.kept.spilled(self._spill))
         self.estimate(everywhere=False)
         if self.result is not None:
             self.costs_m.append(round(self.result.cost_m, 5))
@@ -171,7 +176,8 @@ class Pipeline:
     """All that happens between the bytes and the verdict.
 
     ``session`` and ``created`` go into the calibration as they are. The callbacks are called from
-    within `feed`.
+    within `feed`. ``folder`` has room for what many passes would hold of memory, which is there no longer
+    than the pipeline is.
     """
 
     def __init__(
@@ -180,6 +186,7 @@ class Pipeline:
         *,
         session: str = "",
         created: str = "",
+        folder: Path | None = None,
         on_pass: OnPass | None = None,
         on_transition: OnTransition | None = None,
         on_scan: OnScan | None = None,
@@ -196,10 +203,9 @@ class Pipeline:
         self._reference_point: Any = None  # of a session that was reopened, as the next
         self._origin: Place | None = None
         self._navigation = Navigation(config.navigation, on_pose)
-        self._lasers = {
-            laser.name: _LaserRun(config, laser, self._navigation.trajectory, self._navigation.clock, on_scan)
-            for laser in config.lasers
-        }
+        begin = partial(_LaserRun, config, on_scan=on_scan, spill=Spill(folder))
+        listened = self._navigation.trajectory, self._navigation.clock
+        self._lasers = {laser.name: begin(laser, *listened) for laser in config.lasers}
 
     def begin(self, t_ns: int, past: Past | None = None) -> None:
         """Start the run at host time ``t_ns``; with the ``past`` of a session that goes on, on its passes.

@@ -96,7 +96,11 @@ def replay(
         | {"session": recorded["session"], CAPTURED_IN: str(capture.parent.resolve())}
     )
     pipeline = Pipeline(
-        settings, session=recorded["session"], created=recorded["created"], on_pass=session.write_pass
+        settings,
+        session=recorded["session"],
+        created=recorded["created"],
+        folder=out,
+        on_pass=session.write_pass,
     )
     player = _Player(pipeline, session, as_told=config is None)
     whole_bytes, done_bytes = sum(source.size_bytes for source in sources), 0

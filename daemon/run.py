@@ -74,6 +74,7 @@ class Run:
             config,
             session=session.id,
             created=session.created,
+            folder=session.folder,
             on_pass=self._store,
             on_transition=self._on_transition,
         )

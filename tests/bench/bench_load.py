@@ -36,7 +36,7 @@ from polecal.drivers.emulated.receiver import EmulatedReceiver
 from polecal.drivers.emulated.serve import serve
 from polecal.drivers.emulated.virtual import STREAM_LOGS, play
 from polecal.drivers.emulated.world import HAND_MEASURED, demo_world
-from tests.bench.hearing import HEAD, rss_mb
+from tests.bench.hearing import HEAD, peak_mb, rss_mb
 
 HEADINGS = ("lasers", "what", "value", "unit", "target")
 
@@ -177,15 +177,19 @@ def _live(lasers: int) -> Iterator[tuple[str, float, str, str]]:
                 time.sleep(5.0)  # clocks settle
                 spans = {}
                 with _stretch(spans, "collecting"):
+                    peak_mb(daemon.pid)  # from here on
                     before_s, began_s = _cpu_s(daemon.pid), time.monotonic()
                     time.sleep(COLLECT_S)
                     share = (_cpu_s(daemon.pid) - before_s) / (time.monotonic() - began_s)
                 yield "share of a core, collecting", 100 * share, "%", "≤ 8" if lasers == 1 else ""
-                yield "memory, collecting", rss_mb(daemon.pid), "MB", "≤ 100" if lasers == 1 else ""
+                at_most = "≤ 100" if lasers == 1 else ""
+                yield "memory, collecting", rss_mb(daemon.pid), "MB", at_most
+                yield "memory, peak collecting", peak_mb(daemon.pid), "MB", at_most
                 passes = client.request({"class": "STATUS"})["lasers"][0]["passes"]
                 with _stretch(spans, "solving"):
                     solved = _solve_on(client.path, "" if lasers == 1 else "lms0-", passes)
                 yield "passes; solutions in a second", solved / SOLVE_S, f"of {passes} passes", ""
+                yield "memory, peak solving", peak_mb(daemon.pid), "MB", at_most
                 client.request({"class": "STOP"})
                 yield "memory, at the end", rss_mb(daemon.pid), "MB", ""
         capture = folder / "state" / "sessions" / session / CAPTURE
@@ -276,8 +280,9 @@ def _soak() -> Iterator[tuple[str, float, str, str]]:
             heard.stdin.close()
             held = [json.loads(line) for line in heard.stdout]
     for at in held:
-        what = f"soak: memory after {at['t_s'] / 60:.0f} minutes, {at['passes']} passes"
-        yield what, at["rss_mb"], "MB", ""
+        when = f"{at['t_s'] / 60:.0f} minutes, {at['passes']} passes"
+        yield f"soak: memory after {when}", at["rss_mb"], "MB", ""
+        yield f"soak: memory's peak in the last of {when}", at["peak_mb"], "MB", "≤ 100"
     first, last = held[1], held[-1]
     hours = (last["t_s"] - first["t_s"]) / 3600
     sums_mb = last["sums_mb"] - first["sums_mb"]

@@ -20,18 +20,30 @@ HEAD = struct.Struct("<BqH")
 
 
 def rss_mb(pid: int) -> float:
+    return _status_mb(pid, "VmRSS")
+
+
+def peak_mb(pid: int) -> float:
+    """Give the most that was resident since this was asked last."""
+    most = _status_mb(pid, "VmHWM")
+    Path(f"/proc/{pid}/clear_refs").write_text("5")  # proc(5): the peak is what there is now
+    return most
+
+
+def _status_mb(pid: int, key: str) -> float:
     status = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in status if line.startswith("VmRSS")) / 1024
+    return next(int(line.split()[1]) for line in status if line.startswith(key)) / 1024
 
 
 def tell(pipeline: Pipeline, t_s: float) -> None:
     kept = [one for laser in pipeline._lasers.values() for one in laser.passes]
-    sums = [total for one in kept for total in one.moments.totals.values()]
+    sums = [of for one in kept for of in one.moments.totals.values() if not callable(of.held)]
     held = {
         "t_s": t_s,
         "rss_mb": rss_mb(os.getpid()),
+        "peak_mb": peak_mb(os.getpid()),
         "passes": len(kept),
-        "sums_mb": sum(total.first.nbytes + total.packed.nbytes for total in sums) / 2**20,
+        "sums_mb": sum(of.first.nbytes + of.packed.nbytes for of in sums) / 2**20,
     }
     print(json.dumps(held), flush=True)
 
@@ -40,7 +52,7 @@ def main(config_file: str, capture_file: str, every_s: float) -> None:
     give_back()  # as polecald does
     config = load(config_file)
     devices = [*(laser.name for laser in config.lasers), "span"]
-    pipeline = Pipeline(config)
+    pipeline = Pipeline(config, folder=Path(capture_file).parent)
     begun_ns = due_ns = 0
     with Recorder(Path(capture_file), {}) as capture:
         while head := sys.stdin.buffer.read(HEAD.size):
