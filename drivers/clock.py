@@ -15,7 +15,7 @@ the drift. On the same stamps, USB timer 16 ms and ±50 ppm, the hull's p99 is 0
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 _JUMP_NS = 500_000_000  # no line delay: one of the two clocks was set, or the device started again
 _EARLY_NS = 50_000_000  # nothing arrives before it was sent
@@ -25,8 +25,10 @@ _EARLY_NS = 50_000_000  # nothing arrives before it was sent
 class _Hull:
     """The lower convex hull of points, left to right."""
 
-    x: list[int]
-    y: list[int]
+    x: list[int] = field(default_factory=list)
+    y: list[int] = field(default_factory=list)
+    _edge: int = 0  # where the edge ends that `line` took, 0 once it may be another
+    _line: tuple[float, float] = (0.0, 0.0)
 
     def add(self, x: int, y: int) -> None:
         xs, ys = self.x, self.y
@@ -36,6 +38,8 @@ class _Hull:
                 break
             xs.pop()
             ys.pop()
+        if len(xs) <= self._edge:
+            self._edge = 0
         xs.append(x)
         ys.append(y)
 
@@ -45,9 +49,12 @@ class _Hull:
         Where first stamps were all late, that edge falls more than a clock can: then the next that does not.
         """
         xs, ys = self.x, self.y
+        middle = (xs[0] + xs[-1]) / 2
+        if self._edge and middle <= xs[self._edge]:  # as after most stamps: it only moves to the right
+            return self._line
         if len(xs) < 2:
             return 0.0, float(ys[0])
-        edge = max(1, bisect_left(xs, (xs[0] + xs[-1]) / 2))
+        edge = first = max(1, bisect_left(xs, middle))
         while True:
             x0, x1, y0, y1 = xs[edge - 1], xs[edge], ys[edge - 1], ys[edge]
             slope = (y1 - y0) / (x1 - x0)
@@ -55,7 +62,10 @@ class _Hull:
                 break
             edge += 1
         if abs(slope) <= steepest:  # of an edge of the hull all other points lie above its line
-            return slope, min(y0 - slope * x0, y1 - slope * x1)
+            line = slope, min(y0 - slope * x0, y1 - slope * x1)
+            if edge == first:
+                self._edge, self._line = edge, line
+            return line
         slope = max(-steepest, min(steepest, slope))
         return slope, min(y - slope * x for x, y in zip(xs, ys, strict=True))
 
@@ -94,38 +104,29 @@ class Clock:
         So does, while the map is not `locked`, one that shows the first to have been far too late.
         """
         x = device_ns - self._device0_ns
+        y = host_ns - self._host0_ns - x
         if self._old is not None:
-            late_ns = host_ns - self.to_host(device_ns)
-            if x <= self._last_ns:
-                if x == self._last_ns:
-                    return
-                late_ns = _JUMP_NS + 1  # time went back
-            early_ns = -late_ns if self.locked else self._earlier_than_first_ns(device_ns, host_ns)
-            if late_ns > _JUMP_NS or early_ns > _EARLY_NS:
+            if x == self._last_ns:
+                return
+            late_ns = y - self._offset_ns - self._slope * x
+            # What nobody read for seconds comes at once, the oldest the latest: of that nothing is to be
+            # learnt. So at first it counts how much less late than the first it is, beyond what drift can do.
+            early_ns = -late_ns if self.locked else -y - self._max_drift * x
+            if x < self._last_ns or late_ns > _JUMP_NS or early_ns > _EARLY_NS:
                 self.resets += 1
                 self._clear()
         if self._old is None or self._young is None:
             self._device0_ns, self._host0_ns = device_ns, host_ns
-            self._old, self._young = _Hull([], []), _Hull([], [])
-            x = 0
-        y = host_ns - self._host0_ns - x
+            self._old, self._young = _Hull(), _Hull()
+            x = y = 0
         self._last_ns = x
         if x - self._first_ns >= 2 * self._half_ns and self._young.x:
-            self._old, self._young = self._young, _Hull([], [])
+            self._old, self._young = self._young, _Hull()
             self._first_ns = self._old.x[0]
         self._old.add(x, y)
         if x - self._first_ns >= self._half_ns:
             self._young.add(x, y)
         self._slope, self._offset_ns = self._old.line(self._max_drift)
-
-    def _earlier_than_first_ns(self, device_ns: int, host_ns: int) -> float:
-        """Say how much less late than the first stamp one is, beyond what drift can do.
-
-        What nobody read for seconds comes at once, the oldest the latest: of that nothing is to be learnt.
-        """
-        x = device_ns - self._device0_ns
-        y = host_ns - self._host0_ns - x
-        return -y - self._max_drift * x
 
     def to_host(self, device_ns: float) -> int:
         """Give the host's time at a device time, ns."""
