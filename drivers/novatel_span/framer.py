@@ -22,7 +22,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections import deque
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -68,6 +68,10 @@ class Fault(Enum):
     LENGTH = "impossible length"
     CUT = "cut off"
     END = "the stream ended"
+
+
+# An enum's members take four times as long to look up in it as here, and each frame does so a dozen times.
+_BINARY, _SHORT_BINARY, _ASCII, _NOISE = Kind.BINARY, Kind.SHORT_BINARY, Kind.ASCII, Fault.NOISE
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,59 +120,59 @@ class Frame(NamedTuple):  # as `NavState` is
     @property
     def week(self) -> int | None:
         """GPS week of the header (full, since 1980-01-06), where there is one."""
-        if self.kind in (Kind.BINARY, Kind.PROPRIETARY):
+        if self.kind in _LONG_KINDS:
             return int.from_bytes(self.data[14:16], "little")
-        if self.kind is Kind.SHORT_BINARY:
+        if self.kind is _SHORT_BINARY:
             return int.from_bytes(self.data[6:8], "little")
         if self.kind in _ASCII_KINDS:
-            return int(self._ascii_header[-5 if self.kind is Kind.ASCII else 1])
+            return int(self._ascii_header[-5 if self.kind is _ASCII else 1])
         return None
 
     @property
     def ms(self) -> int | None:
         """Milliseconds of the GPS week of the header, where there is one."""
-        if self.kind in (Kind.BINARY, Kind.PROPRIETARY):
+        if self.kind in _LONG_KINDS:
             return int.from_bytes(self.data[16:20], "little")
-        if self.kind is Kind.SHORT_BINARY:
+        if self.kind is _SHORT_BINARY:
             return int.from_bytes(self.data[8:12], "little")
         if self.kind in _ASCII_KINDS:
-            return round(float(self._ascii_header[-4 if self.kind is Kind.ASCII else 2]) * 1000)
+            return round(float(self._ascii_header[-4 if self.kind is _ASCII else 2]) * 1000)
         return None
 
     @property
     def time_status(self) -> TimeStatus | int | None:
         """Quality of the header's time; None for kinds without it (short headers have none)."""
-        if self.kind in (Kind.BINARY, Kind.PROPRIETARY):
+        if self.kind in _LONG_KINDS:
             return named(TimeStatus, self.data[13])
-        if self.kind is Kind.ASCII:
+        if self.kind is _ASCII:
             return TimeStatus.__members__.get(self._ascii_header[4])
         return None
 
     @property
     def receiver_status(self) -> int | None:
         """The header's receiver status word (sheet 3.5), where there is one."""
-        if self.kind in (Kind.BINARY, Kind.PROPRIETARY):
+        if self.kind in _LONG_KINDS:
             return int.from_bytes(self.data[20:24], "little")
-        return int(self._ascii_header[-3], 16) if self.kind is Kind.ASCII else None
+        return int(self._ascii_header[-3], 16) if self.kind is _ASCII else None
 
     @property
     def port_address(self) -> int | None:
         """Low byte of the id of the port that it was sent on, of a long binary header."""
-        return self.data[7] if self.kind in (Kind.BINARY, Kind.PROPRIETARY) else None
+        return self.data[7] if self.kind in _LONG_KINDS else None
 
     @property
     def is_response(self) -> bool:
         """Whether it answers a binary or ASCII command, rather than being a log."""
-        if self.kind is Kind.BINARY:
+        if self.kind is _BINARY:
             return bool(self.data[6] & RESPONSE_BIT)
-        return self.kind is Kind.ASCII and self._ascii_name[1] == "R"
+        return self.kind is _ASCII and self._ascii_name[1] == "R"
 
     @property
     def body(self) -> bytes:
         """What lies between header and checksum; empty for kinds without a header."""
-        if self.kind in (Kind.BINARY, Kind.PROPRIETARY):
+        if self.kind in _LONG_KINDS:
             return self.data[self.data[3] : -CRC_BYTES]
-        if self.kind is Kind.SHORT_BINARY:
+        if self.kind is _SHORT_BINARY:
             return self.data[SHORT_HEADER_BYTES:-CRC_BYTES]
         if self.kind in _ASCII_KINDS:
             return self.data[self.data.index(b";") + 1 : self.data.rindex(b"*")]
@@ -189,12 +193,12 @@ class Frame(NamedTuple):  # as `NavState` is
         Message id, measurement source, sequence number, week, ms.
         """
         source = sequence = 0
-        if self.kind is Kind.SHORT_BINARY:  # as below, in half the time
+        if self.kind is _SHORT_BINARY:  # as below, in half the time
             message, week, ms = _SHORT_KEY.unpack_from(self.data, 4)
             return message, source, sequence, week, ms
-        if self.kind is Kind.BINARY:
+        if self.kind is _BINARY:
             source, sequence = self.data[6] & SOURCE_MASK, int.from_bytes(self.data[10:12], "little")
-        elif self.kind is Kind.ASCII:
+        elif self.kind is _ASCII:
             source, sequence = self._ascii_name[2], int(self._ascii_header[2])
         return self.message_id, source, sequence, self.week, self.ms
 
@@ -209,7 +213,8 @@ class Frame(NamedTuple):  # as `NavState` is
         return self.data[1 : self.data.index(b";")].decode("ascii").split(",")
 
 
-BINARY_KINDS = frozenset({Kind.BINARY, Kind.SHORT_BINARY, Kind.PROPRIETARY})
+_LONG_KINDS = frozenset({Kind.BINARY, Kind.PROPRIETARY})  # with the long header
+BINARY_KINDS = _LONG_KINDS | {Kind.SHORT_BINARY}
 _ASCII_KINDS = frozenset({Kind.ASCII, Kind.SHORT_ASCII})
 _UNCHECKED_KINDS = frozenset({Kind.ABBREVIATED, Kind.REPLY, Kind.PROMPT})
 _SHORT_KEY = struct.Struct("<HHI")  # id, week, ms of a short header, from its fifth byte on
@@ -227,10 +232,10 @@ _PROMPT_BYTES = 16
 _SHORT_TEXT_BYTES = 512  # of a reply or an abbreviated line
 
 # the ten header fields of ASCII, the three of short ASCII (sheet 1.5)
-_ASCII = re.compile(
+_ASCII_LINE = re.compile(
     rb"#[A-Z][A-Z0-9_]{1,40},[A-Z0-9_]+,\d+,[\d.]+,[A-Z]+,\d+,\d+\.?\d*,[0-9A-Fa-f]{8},[0-9A-Fa-f]+,\d+;.*\*([0-9A-Fa-f]{8})"
 )
-_SHORT_ASCII = re.compile(rb"%[A-Z][A-Z0-9_]{1,40},\d+,\d+\.?\d*;.*\*([0-9A-Fa-f]{8})")
+_SHORT_ASCII_LINE = re.compile(rb"%[A-Z][A-Z0-9_]{1,40},\d+,\d+\.?\d*;.*\*([0-9A-Fa-f]{8})")
 _NMEA = re.compile(rb"\$[A-Z][A-Z0-9]{2,},.*\*([0-9A-Fa-f]{2})")
 _LOOKS_ASCII = re.compile(rb"[#%$][A-Z][A-Z0-9_]+,")
 
@@ -251,8 +256,8 @@ def _extent(buffer: bytes, at: int) -> _Match:
     sync = buffer[at : at + 3]
     kind = _SYNCS.get(sync)
     if kind is None:
-        return None if any(whole.startswith(sync) for whole in _SYNCS) else Fault.NOISE
-    if kind is Kind.SHORT_BINARY:
+        return None if any(whole.startswith(sync) for whole in _SYNCS) else _NOISE
+    if kind is _SHORT_BINARY:
         if have < 4:
             return None
         header_bytes, body_bytes = SHORT_HEADER_BYTES, buffer[at + 3]
@@ -270,7 +275,7 @@ def _binary(buffer: bytes, at: int) -> _Match:
     match = _extent(buffer, at)
     if not isinstance(match, tuple):
         return match
-    _, end = match
+    end = match[1]
     if end > len(buffer):
         return end
     return match if crc32(buffer[at:end]) == 0 else Fault.CRC  # over its own CRC too it is 0
@@ -317,8 +322,8 @@ def _xor(data: bytes) -> int:
 
 
 _TEXT_KINDS = {
-    b"#": (Kind.ASCII, _ASCII),
-    b"%": (Kind.SHORT_ASCII, _SHORT_ASCII),
+    b"#": (Kind.ASCII, _ASCII_LINE),
+    b"%": (Kind.SHORT_ASCII, _SHORT_ASCII_LINE),
     b"$": (Kind.NMEA, _NMEA),
 }
 
@@ -385,45 +390,45 @@ class Framer:
         self._rest = b""
         self._announced = 0  # how long the frame will be that _rest is the beginning of, where that is known
         self._offset = 0  # of the first byte of _rest in the stream
-        self._chunks: deque[tuple[int, int]] = deque()  # (offset behind its last byte, stamp)
+        self._ends: list[int] = []  # of each chunk that _rest has bytes of, the offset behind its last byte,
+        self._stamps: list[int] = []  # and its stamp
 
     def feed(self, data: bytes, t_ns: int) -> list[Frame]:
         """Take a chunk with its stamp (CLOCK_MONOTONIC, ns); return the frames that ended in it."""
         buffer = self._rest + data
-        self._chunks.append((self._offset + len(buffer), t_ns))
+        self._ends.append(self._offset + len(buffer))
+        self._stamps.append(t_ns)
         if len(buffer) < self._announced:  # most chunks end within a frame
             self._rest = buffer
             return []
         frames: list[Frame] = []
-        junk_at, reason = 0, Fault.NOISE  # where the bytes begin that belong to no frame, and why
+        junk_at, reason = 0, _NOISE  # where the bytes begin that belong to no frame, and why
         at = self._announced = 0
         while start := _START.search(buffer, at):
             at = start.start()
             match = _MATCHERS[buffer[at]](buffer, at)
-            if match is None:
-                break
-            if isinstance(match, int):
-                self._announced = match - at
-                break
-            if isinstance(match, Fault):
-                if match is not Fault.NOISE:
+            if isinstance(match, tuple):
+                kind, end = match
+                self._skip(buffer, junk_at, at, reason)
+                frames.append(self._frame(buffer[at:end], self._offset + at, kind))
+                at = junk_at = end
+                reason = _NOISE
+            elif isinstance(match, Fault):
+                if match is not _NOISE:
                     self.bad_frames += 1
-                    if reason is Fault.NOISE:
+                    if reason is _NOISE:
                         reason = match
                 at += 1
-                continue
-            self._skip(buffer, junk_at, at, reason)
-            kind, end = match
-            frames.append(self._frame(buffer[at:end], self._offset + at, kind))
-            at = junk_at = end
-            reason = Fault.NOISE
+            else:
+                self._announced = 0 if match is None else match - at
+                break
         else:
             at = len(buffer)
         self._skip(buffer, junk_at, at, reason)
         self._rest = buffer[at:]
         self._offset += at
-        while self._chunks and self._chunks[0][0] <= self._offset:
-            self._chunks.popleft()
+        done = bisect_right(self._ends, self._offset)
+        del self._ends[:done], self._stamps[:done]
         return frames
 
     def close(self) -> None:
@@ -432,16 +437,14 @@ class Framer:
         self._offset += len(self._rest)
         self._rest = b""
         self._announced = 0
-        self._chunks.clear()
+        self._ends.clear()
+        self._stamps.clear()
 
     def _frame(self, data: bytes, offset: int, kind: Kind) -> Frame:
         self.frames += 1
-        chunks = self._chunks
-        while chunks[0][0] <= offset:
-            chunks.popleft()
-        first_end, t_first_ns = chunks[0]
-        t_last_ns = next(t_ns for end, t_ns in chunks if end >= offset + len(data))
-        return Frame(offset, data, t_first_ns, t_last_ns, first_end - offset, kind)
+        first, last = bisect_right(self._ends, offset), bisect_left(self._ends, offset + len(data))
+        stamps = self._stamps
+        return Frame(offset, data, stamps[first], stamps[last], self._ends[first] - offset, kind)
 
     def _skip(self, buffer: bytes, start: int, end: int, reason: Fault) -> None:
         if self._on_skip and end > start:
