@@ -50,6 +50,8 @@ _LONG_NS = 1_500_000_000  # of two readings of a log that comes once a second; a
 _SETTLE_NS = 1_000_000_000
 _STALE_NS = 5_000_000_000  # what comes once a second has ceased
 _SILENT_NS = 1_000_000_000
+_EVER_NS = 1 << 63
+_INSPVAX = int(MessageId.INSPVAX)  # a plain number is compared in an eighth of the time
 
 _LOGS_BESIDE = frozenset(
     {
@@ -59,6 +61,16 @@ _LOGS_BESIDE = frozenset(
 )
 
 TIME, TYPE, SIGMA, COURSE = "time status", "position type", "standard deviations", "azimuth off the course"
+_CEASED = {
+    TIME: "the receiver has ceased to tell how well it knows the time",
+    TYPE: "the receiver has ceased to tell what its position rests on",
+    SIGMA: "the receiver has ceased to tell its standard deviations",
+}
+_UNKNOWN = {
+    SIGMA: "the receiver tells no standard deviations: they are not checked",
+    TYPE: "the receiver does not tell what its position rests on: it is not checked",
+    TIME: "the receiver does not tell how well it knows the time: it is not checked",
+}
 
 _STRAIGHT_NS = 1_000_000_000
 _STEP_NS = 50_000_000
@@ -174,18 +186,24 @@ class Navigation:
         self._trust = Trust()
         self._course = CourseWatch()
         self._now_ns = self._used_ns = self._pose_ns = self._plain_ns = 0
-        self._time_status: tuple[int, TimeStatus | int] | None = None
-        self._type: tuple[int, PositionType | int, bool] | None = None  # of the inertial solution itself?
-        self._accuracy: tuple[int, Accuracy] | None = None
+        self._told: dict[
+            str, tuple[int, Fault | None]
+        ] = {}  # when it last said so, and what is wrong with it
+        self._sound_until_ns = _EVER_NS  # nothing that was told is wrong, or too old by then
+        self._time_status: TimeStatus | int | None = None
+        self._inertial_type = False  # position_type is that of the inertial solution itself
+        self._accuracy: Accuracy | None = None
 
     def feed(self, t_ns: int, data: bytes) -> bool:
         """Take a chunk that was read at host time ``t_ns`` (CLOCK_MONOTONIC ns); say if a frame ended."""
-        self.tick(t_ns)
+        self._now_ns = t_ns
         frames = self.framer.feed(data, t_ns)
+        if not frames:  # as with most chunks
+            return False
         for frame in frames:
             if frame.kind.checked and not frame.is_response and self._copies.is_new(frame):
                 self._take(frame)
-        return bool(frames)
+        return True
 
     def tick(self, t_ns: int) -> None:
         """Let time go on to host time ``t_ns``, whether or not anything came."""
@@ -217,12 +235,7 @@ class Navigation:
         """What cannot be checked, though poses are used."""
         if self.why_not:
             return []
-        unknown = [
-            (self._accuracy, "tells no standard deviations: they are not checked"),
-            (self._type, "does not tell what its position rests on: it is not checked"),
-            (self._time_status, "does not tell how well it knows the time: it is not checked"),
-        ]
-        notes = [f"the receiver {what}" for told, what in unknown if told is None]
+        notes = [words for kind, words in _UNKNOWN.items() if kind not in self._told]
         if self._course.off_deg is None:
             notes.append("azimuth and course over ground are not compared yet: drive straight for a second")
         return notes
@@ -242,14 +255,14 @@ class Navigation:
     def _take(self, frame: Frame) -> None:
         t_ns = frame.t_first_ns
         if (status := frame.time_status) is not None and status != TimeStatus.SATTIME:
-            self._time_status = t_ns, status
+            self._time(t_ns, status)
         message = frame.message_id
         if message in _LOGS_BESIDE:
             self._note(t_ns, parse(frame))
         pose = nav_state(frame)
         if pose is None:
             return
-        if message != MessageId.INSPVAX:
+        if message != _INSPVAX:
             self._plain_ns = t_ns
         elif self._plain_ns and t_ns - self._plain_ns < _SILENT_NS:
             return  # it came for its standard deviations
@@ -261,12 +274,28 @@ class Navigation:
         if isinstance(said, Time) and said.utc_status == UtcStatus.VALID:
             self.quality.utc_offset_s = said.utc_offset_s
         if (told := accuracy(said)) is not None:
-            self._accuracy = t_ns, told
+            self._accuracy = told
+            self._tell(SIGMA, t_ns, self._uncertain(told))
         if (rests_on := position_type(said)) is not None:
             inertial = told is not None  # INSPVAX, which is what the poses rest on; BESTPOS may be another
-            if inertial or self._type is None or not self._type[2] or t_ns - self._type[0] > _STALE_NS:
-                self._type = t_ns, rests_on, inertial
-                self.position_type = rests_on
+            if inertial or not self._inertial_type or t_ns - self._told[TYPE][0] > _STALE_NS:
+                self.position_type, self._inertial_type = rests_on, inertial
+                words = f"the position is only {name_of(rests_on)}: check that corrections reach the receiver"
+                self._tell(TYPE, t_ns, None if rests_on in self._types else Fault(TYPE, words))
+
+    def _time(self, t_ns: int, status: TimeStatus | int) -> None:
+        if status == self._time_status:  # as with each pose that has a long header
+            wrong = self._told[TIME][1]
+        else:
+            words = f"the receiver's time is only {name_of(status)}: wait for more satellites"
+            wrong = None if status in self._time_statuses else Fault(TIME, words)
+            self._time_status = status
+        self._tell(TIME, t_ns, wrong)
+
+    def _tell(self, kind: str, t_ns: int, wrong: Fault | None) -> None:
+        """Note what the receiver says of itself, so that as a rule a pose need not be held against it."""
+        self._told[kind] = t_ns, wrong
+        self._sound_until_ns = min(0 if fault else at_ns + _STALE_NS for at_ns, fault in self._told.values())
 
     def _use(self, pose: NavState, t_ns: int, left_ns: int) -> None:
         """Use a pose, or not, that came at ``t_ns`` and whose first byte left the receiver at ``left_ns``."""
@@ -274,50 +303,33 @@ class Navigation:
         self._pose_ns = t_ns
         self.ins_status = pose.ins_status
         if pose.good:
-            sigma_mps = max(self._accuracy[1].velocity_mps) if self._accuracy else 0.0
-            self._course.add(pose, sigma_mps)
+            self._course.add(pose, max(self._accuracy.velocity_mps) if self._accuracy else 0.0)
+            faults = self._faults(t_ns)
+            if not faults or faults[0].kind != TIME:
+                self.clock.update(pose.gps_ns, left_ns)
         else:
             self._course.forget()
-        faults = self._faults(pose, t_ns)
-        if pose.good and not any(fault.kind == TIME for fault in faults):
-            self.clock.update(pose.gps_ns, left_ns)
+            name = str(name_of(pose.ins_status))
+            meaning = getattr(pose.ins_status, "meaning", "nothing is used before it is good")
+            faults = [Fault(name, f"navigation says {name}: {meaning}")]
         used = self._trust.judge(t_ns, faults)
-        rests_on = self._type[1] if self._type is not None else None
-        told = self._accuracy[1] if self._accuracy is not None else None
-        self.quality.add(pose.gps_ns, used, pose.ins_status, rests_on, told)
+        self.quality.add(pose.gps_ns, used, pose.ins_status, self.position_type, self._accuracy)
         if used:
             self._used_ns = t_ns
             self.trajectory.add(pose)
         if self._on_pose is not None:
             self._on_pose(pose, used)
 
-    def _faults(self, pose: NavState, t_ns: int) -> list[Fault]:
-        if not pose.good:
-            name = str(name_of(pose.ins_status))
-            meaning = getattr(pose.ins_status, "meaning", "nothing is used before it is good")
-            return [Fault(name, f"navigation says {name}: {meaning}")]
+    def _faults(self, t_ns: int) -> list[Fault]:
+        """Say what is wrong with a pose that the receiver calls good: its time first."""
         faults: list[Fault] = []
-        if self._time_status is not None:
-            known_ns, time = self._time_status
-            if t_ns - known_ns > _STALE_NS:
-                faults.append(Fault(TIME, "the receiver has ceased to tell how well it knows the time"))
-            elif time not in self._time_statuses:
-                faults.append(
-                    Fault(TIME, f"the receiver's time is only {name_of(time)}: wait for more satellites")
-                )
-        if self._type is not None:
-            known_ns, rests_on, _ = self._type
-            if t_ns - known_ns > _STALE_NS:
-                faults.append(Fault(TYPE, "the receiver has ceased to tell what its position rests on"))
-            elif rests_on not in self._types:
-                words = f"the position is only {name_of(rests_on)}: check that corrections reach the receiver"
-                faults.append(Fault(TYPE, words))
-        if self._accuracy is not None:
-            known_ns, told = self._accuracy
-            if t_ns - known_ns > _STALE_NS:
-                faults.append(Fault(SIGMA, "the receiver has ceased to tell its standard deviations"))
-            else:
-                faults += self._uncertain(told)
+        if t_ns > self._sound_until_ns:
+            for kind, words in _CEASED.items():
+                told_ns, wrong = self._told.get(kind, (t_ns, None))
+                if t_ns - told_ns > _STALE_NS:
+                    faults.append(Fault(kind, words))
+                elif wrong is not None:
+                    faults.append(wrong)
         off_deg = self._course.off_deg
         if off_deg is not None and abs(off_deg) > self._settings.max_off_course_deg:
             cause = (
@@ -328,7 +340,7 @@ class Navigation:
             faults.append(Fault(COURSE, f"azimuth is {abs(off_deg):.0f}° off the course: {cause}"))
         return faults
 
-    def _uncertain(self, told: Accuracy) -> list[Fault]:
+    def _uncertain(self, told: Accuracy) -> Fault | None:
         most = self._settings.max_sigma
         north, east, down = told.position_m
         roll, pitch, azimuth = told.attitude_deg
@@ -344,7 +356,7 @@ class Navigation:
             for what, sigma, bound, unit in checks
             if sigma > bound
         ]
-        return [Fault(SIGMA, f"the receiver is uncertain of its {', '.join(over)}")] if over else []
+        return Fault(SIGMA, f"the receiver is uncertain of its {', '.join(over)}") if over else None
 
 
 def name_of(value: InsStatus | PositionType | TimeStatus | int | None) -> str | None:

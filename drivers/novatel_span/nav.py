@@ -32,6 +32,7 @@ WEEK_NS = 604_800 * 10**9
 Triple = tuple[float, float, float]
 
 _INSPVA = layout(InsPva)
+_GOOD = InsStatus.INS_SOLUTION_GOOD
 
 _PLAIN_LOGS: dict[int, str] = {
     message: message.name
@@ -68,7 +69,7 @@ class NavState(NamedTuple):  # of which there are hundreds in a second: made in 
     @property
     def good(self) -> bool:
         """Whether the receiver calls it INS_SOLUTION_GOOD; nothing else may be used."""
-        return self.ins_status == InsStatus.INS_SOLUTION_GOOD
+        return self.ins_status == _GOOD
 
 
 @dataclass(frozen=True, slots=True)
