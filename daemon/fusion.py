@@ -177,8 +177,7 @@ class LaserChannel:
             self._host_jumped()
         if self._waiting and self._seen_ns - self._waiting[0].stx_ns >= _TOGETHER_NS:
             self._place_next()
-        oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns
-        return self._closed(oldest_ns)
+        return self._closed(self._waiting[0].stx_ns if self._waiting else self._seen_ns)
 
     def _host_jumped(self) -> None:
         """Learn the mirror's clock anew, as the receiver's had to be.

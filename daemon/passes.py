@@ -81,6 +81,11 @@ class OpenPass:
     last_ns: int
     parts: list[tuple[NDArray[np.int64], Returns]]
 
+    @property
+    def ends_ns(self) -> int:
+        """Until when it goes on, if it is not seen again."""
+        return min(self.last_ns + _OUT_OF_VIEW_NS, self.first_ns + _LONGEST_NS)
+
 
 class PassBuilder:
     """Collects returns place by place, and closes a pass once its place has not been seen for a while."""
@@ -92,6 +97,7 @@ class PassBuilder:
         """Ground returns left out, as they stood out of the ground."""
         self._slice_deg = slice_deg
         self._open: dict[int, OpenPass] = {}
+        self._ends_ns = 0  # of the first of them to end
         self._site, self._count = site, count
 
     def add(
@@ -108,19 +114,16 @@ class PassBuilder:
         current = self._open.setdefault(place, OpenPass(place, *t_ns, []))
         current.last_ns = t_ns[1]
         current.parts.append((gps_ns, returns))
+        self._ends_ns = min(one.ends_ns for one in self._open.values())
 
     def close(self, mount: Mount, t_ns: int | None = None) -> list[StoredPass]:
         """Give the passes that have ended by host time ``t_ns``; all that are open if None.
 
         ``mount`` is the best known, to tell even ground from what stands on it.
         """
-        if not self._open:
+        if not self._open or (t_ns is not None and t_ns <= self._ends_ns):
             return []
-        ended = [
-            place
-            for place, one in self._open.items()
-            if t_ns is None or t_ns - one.last_ns > _OUT_OF_VIEW_NS or t_ns - one.first_ns > _LONGEST_NS
-        ]
+        ended = [place for place, one in self._open.items() if t_ns is None or t_ns > one.ends_ns]
         closed = []
         for place in ended:
             one = self._open.pop(place)
@@ -147,6 +150,7 @@ class PassBuilder:
                     facts=facts.of(returns, gps_ns),
                 )
             )
+        self._ends_ns = min((one.ends_ns for one in self._open.values()), default=0)
         return closed
 
     @property
