@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, insort
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +86,8 @@ def _together(bright: Indices, range_m: Array) -> list[Indices]:
 
 @dataclass(slots=True)
 class _Place:
-    north_east_m: Array
+    north_m: float
+    east_m: float
     sightings: int = 0
     wide: int = 0
 
@@ -95,18 +98,21 @@ class Places:
     def __init__(self) -> None:
         self._places: list[_Place] = []
 
-    def sight(self, point_ne_m: Array, gate_m: float, *, thin: bool) -> int | None:
-        """Give the place of a sighting at (2,) north, east; None where there are too many places already."""
-        number = self._nearest(point_ne_m, gate_m)
+    def sight(self, point_ne_m: Sequence[float], gate_m: float, *, thin: bool) -> int | None:
+        """Give the place of a sighting at north, east; None where there are too many places already."""
+        north_m, east_m = point_ne_m
+        number = self._nearest(north_m, east_m, gate_m)
         if number is None:
             if len(self._places) == _MOST_PLACES:
                 return None
             number = len(self._places)
-            self._places.append(_Place(point_ne_m.astype(np.float64)))
+            self._places.append(_Place(north_m, east_m))
         place = self._places[number]
         place.sightings += 1
         place.wide += not thin
-        place.north_east_m += (point_ne_m - place.north_east_m) / min(place.sightings, _MEMORY_SCANS)
+        part = 1 / min(place.sightings, _MEMORY_SCANS)
+        place.north_m += (north_m - place.north_m) * part
+        place.east_m += (east_m - place.east_m) * part
         return number
 
     def could_be_pole(self, number: int) -> bool:
@@ -116,23 +122,23 @@ class Places:
 
     def at(self, number: int) -> tuple[float, float]:
         """Give a place's north and east in m."""
-        north, east = self._places[number].north_east_m
-        return float(north), float(east)
+        return self._places[number].north_m, self._places[number].east_m
 
-    def _nearest(self, point_ne_m: Array, gate_m: float) -> int | None:
+    def _nearest(self, north_m: float, east_m: float, gate_m: float) -> int | None:
         if not self._places:
             return None
-        offsets = np.stack([place.north_east_m for place in self._places]) - point_ne_m
-        distance_m = np.linalg.norm(offsets, axis=1)
-        nearest = int(np.argmin(distance_m))
-        return nearest if distance_m[nearest] <= gate_m else None
+        away_m = [math.hypot(one.north_m - north_m, one.east_m - east_m) for one in self._places]
+        nearest = min(range(len(away_m)), key=away_m.__getitem__)
+        return nearest if away_m[nearest] <= gate_m else None
 
 
 @dataclass(slots=True)
 class Ground:
     """The level of the ground in n, from dull returns; and which returns are it."""
 
-    _levels_m: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY_SCANS))
+    _levels_m: deque[float] = field(default_factory=deque)
+    _ordered_m: list[float] = field(default_factory=list)
+    """The same, the lowest first."""
 
     def beams(self, range_m: Array, reflectivity: Array, down_m: Array) -> NDArray[np.bool_]:
         """Say which of K scans' (K, N) returns are it, ``down_m`` their z in n; NaN where there is none."""
@@ -146,10 +152,18 @@ class Ground:
         for number, count in enumerate(dull.sum(axis=1).tolist()):
             if count:
                 middle = ordered[number, [(count - 1) // 2, count // 2]]
-                self._levels_m.append(float(middle.sum()) / 2)
-                level_m[number] = median(self._levels_m)
+                level_m[number] = self._median_m(float(middle.sum()) / 2)
         ground: NDArray[np.bool_] = dull & (np.abs(down_m - level_m[:, None]) <= _GROUND_BAND_M)
         return ground
+
+    def _median_m(self, level_m: float) -> float:
+        """Take the next scan's level; give the median over the last of them."""
+        if len(self._levels_m) == _MEMORY_SCANS:
+            del self._ordered_m[bisect_left(self._ordered_m, self._levels_m.popleft())]
+        self._levels_m.append(level_m)
+        insort(self._ordered_m, level_m)
+        count = len(self._ordered_m)
+        return (self._ordered_m[(count - 1) // 2] + self._ordered_m[count // 2]) / 2
 
 
 def even_ground(range_m: Array, bearing_rad: Array, down_m: Array) -> NDArray[np.bool_]:

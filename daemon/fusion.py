@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polecal.calib import Kind, Mount, points_nav
+from polecal.calib import Kind, Mount, Returns, points_nav
+from polecal.calib.geometry import rotation_rows
+from polecal.calib.observations import points_body
 from polecal.calib.segment import RETRO_REFLECTIVE, Ground, Places, Reflector, reflectors
 from polecal.daemon.config import Config, Laser
 from polecal.daemon.passes import OpenPass, PassBuilder, StoredPass, observed
-from polecal.daemon.trajectory import Trajectory
+from polecal.daemon.trajectory import Path, Trajectory
 from polecal.drivers.clock import Clock
 from polecal.drivers.errors import DeviceProtocolError
 from polecal.drivers.port import BITS_PER_BYTE
@@ -43,6 +45,7 @@ _TOGETHER_NS = 1_000_000_000  # a second's scans are placed at once: one by one 
 _MOST_WAITING = 256  # scans that wait for their poses: 14 s at 18.8 Hz
 _SLOWEST_MPS, _SLOWEST_RADPS = 0.05, 0.02  # a vehicle that stands adds weight and no information
 _GATE_M = (0.5, 2.5)
+_DOWN_ROLL_PITCH = slice(2, 5)
 
 NO_POSE = "no pose at the beam's time"
 NO_CLOCK = "clocks not settled yet"
@@ -226,47 +229,76 @@ class LaserChannel:
 
     def _place(self, scans: list[_Waiting], gps_ns: NDArray[np.int64]) -> None:
         """Place K scans of N beams, whose GPS times are (K, N)."""
-        poses = self._trajectory.at(gps_ns.ravel())
-        known = poses.known.reshape(gps_ns.shape)
+        path = self._trajectory.path(gps_ns.ravel())
+        known = path.known.reshape(gps_ns.shape)
         self.dropped[NO_POSE] += int(np.count_nonzero(~known))
-        standing = _mean_norm(poses.velocity_mps, known) < _SLOWEST_MPS
-        standing &= _mean_norm(poses.rate_radps, known) < _SLOWEST_RADPS
+        moves_mps, turns_radps = (_mean(of.reshape(gps_ns.shape), known) for of in path.speeds())
+        standing = (moves_mps < _SLOWEST_MPS) & (turns_radps < _SLOWEST_RADPS)
         self.dropped[STANDING] += int(np.count_nonzero(known[standing]))
-        range_m = np.where(known, np.stack([scan.range_m for scan in scans]), np.nan)
-        kind = np.full(gps_ns.size, Kind.GROUND, dtype=np.uint8)
-        bearing_rad = np.tile(self._bearing_rad, len(scans))
-        every = observed(np.nan_to_num(range_m).ravel(), bearing_rad, poses, kind)
-        points = points_nav(every, self.mount).reshape(*gps_ns.shape, 3)
         moving = np.flatnonzero(~standing)
-        reflectivity = np.stack([scan.reflectivity for scan in scans])[moving]
-        ground = self._ground.beams(range_m[moving], reflectivity, points[moving, :, 2]) & self._sparse
-        seen: defaultdict[int, list[_Sighting]] = defaultdict(list)  # by place
-        for number, on_ground in zip(moving.tolist(), ground, strict=True):
-            scan, first = scans[number], number * len(self._bearing_rad)
-            for place, beams in self._sighted(scan, known[number], points[number]).items():
-                kind[first + beams] = Kind.POLE  # of ``every``, too
-                rows = first + np.concatenate([beams, np.flatnonzero(on_ground)])
-                seen[place].append((scan.stx_ns, rows))
-        for place, parts in seen.items():
-            rows = np.concatenate([part for _, part in parts])
-            self._builder.add(place, (parts[0][0], parts[-1][0]), gps_ns.ravel()[rows], every[rows])
+        range_m = np.where(known, np.stack([scan.range_m for scan in scans]), np.nan)
+        reflectivity = np.stack([scan.reflectivity for scan in scans])
+        down_m = self._down_m(np.nan_to_num(range_m), path)
+        ground = np.zeros(gps_ns.shape, dtype=bool)
+        ground[moving] = self._ground.beams(range_m[moving], reflectivity[moving], down_m[moving])
+        ground &= self._sparse
+        kind = np.full(gps_ns.size, Kind.GROUND, dtype=np.uint8)
+
+        def returns(rows: NDArray[np.int64]) -> Returns:
+            bearing_rad = self._bearing_rad[rows % len(self._bearing_rad)]
+            return observed(range_m.ravel()[rows], bearing_rad, path.poses(rows), kind[rows])
+
+        seen: defaultdict[tuple[int, int], list[NDArray[np.int64]]] = defaultdict(list)  # by place and scan
+        for place, number, rows in self._sighted(scans, moving, known, returns):
+            kind[rows] = Kind.POLE
+            seen[place, number].append(rows)  # one reflector may be seen in pieces
+        parts: defaultdict[int, list[_Sighting]] = defaultdict(list)
+        for (place, number), pieces in seen.items():
+            on_ground = np.flatnonzero(ground[number]) + number * len(self._bearing_rad)
+            parts[place].append((scans[number].stx_ns, np.concatenate([*pieces, on_ground])))
+        for place, sightings in parts.items():
+            rows = np.concatenate([each for _, each in sightings])
+            t_ns = sightings[0][0], sightings[-1][0]
+            self._builder.add(place, t_ns, gps_ns.ravel()[rows], returns(rows))
+
+    def _down_m(self, range_m: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+        """Give z in n of K scans' returns at (K, N) ranges."""
+        origin_m = self.mount.vector[:3]
+        rays = points_body(np.ones_like(self._bearing_rad), self._bearing_rad, self.mount) - origin_m
+        state = path.states(_DOWN_ROLL_PITCH)
+        down_m = state[:, 0].reshape(range_m.shape).copy()
+        (down,) = rotation_rows(state[:, 1:], (2,))
+        for along, ray, at_m in zip(down, rays.T, origin_m, strict=True):
+            down_m += along.reshape(range_m.shape) * (range_m * ray + at_m)
+        return down_m
 
     def _sighted(
-        self, scan: _Waiting, known: NDArray[np.bool_], points: NDArray[np.float64]
-    ) -> dict[int, NDArray[np.int64]]:
-        """Give the beams that met what could be the pole, by place; ``points`` are all beams' (N, 3) in n."""
-        sighted: dict[int, NDArray[np.int64]] = {}
-        for reflector in scan.found:
-            beams = reflector.beams[known[reflector.beams]]
-            if not len(beams):
-                continue
-            at_ne_m = points[beams, :2].mean(axis=0)
-            place = self.places.sight(at_ne_m, self._gate_m(reflector.range_m), thin=reflector.thin)
-            if place is None or not reflector.thin or not self.places.could_be_pole(place):
-                self.dropped[OTHER_REFLECTOR] += len(beams)
-            else:  # one reflector may be seen in pieces
-                sighted[place] = np.concatenate([sighted[place], beams]) if place in sighted else beams
-        return sighted
+        self,
+        scans: list[_Waiting],
+        moving: NDArray[np.int64],
+        known: NDArray[np.bool_],
+        returns: Callable[[NDArray[np.int64]], Returns],
+    ) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+        """Give the place, the scan's number and the rows of the beams of what could be the pole."""
+        width = len(self._bearing_rad)
+        met = [
+            (number, one, number * width + beams)
+            for number in moving.tolist()
+            for one in scans[number].found
+            if len(beams := one.beams[known[number, one.beams]])
+        ]
+        if not met:
+            return
+        counts = [len(rows) for _, _, rows in met]
+        points = points_nav(returns(np.concatenate([rows for _, _, rows in met])), self.mount)
+        starts = np.cumsum([0, *counts[:-1]])
+        north_east_m = np.add.reduceat(points[:, :2], starts) / np.array(counts)[:, None]
+        for (number, one, rows), at_ne_m in zip(met, north_east_m.tolist(), strict=True):
+            place = self.places.sight(at_ne_m, self._gate_m(one.range_m), thin=one.thin)
+            if place is None or not one.thin or not self.places.could_be_pole(place):
+                self.dropped[OTHER_REFLECTOR] += len(rows)
+            else:
+                yield place, number, rows
 
     def _gate_m(self, range_m: float) -> float:
         """How far off the hand measurement may put a sighting."""
@@ -275,8 +307,7 @@ class LaserChannel:
         return min(max(wide_m, _GATE_M[0]), _GATE_M[1])
 
 
-def _mean_norm(vectors: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Give the mean length (K,) of each scan's vectors (K N, 3) where they are known, 0 where none is."""
-    lengths = np.sqrt(np.einsum("ni,ni->n", vectors, vectors)).reshape(known.shape)
-    mean: NDArray[np.float64] = np.where(known, lengths, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+def _mean(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Give the mean (K,) of each scan's values (K, N) where they are known, 0 where none is."""
+    mean: NDArray[np.float64] = np.where(known, values, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     return mean

@@ -38,7 +38,7 @@ def trajectory():
 
 def at(trajectory, *periods):
     """Poses at so many periods after the first."""
-    return trajectory.at(np.array([GPS_NS + round(count * PERIOD_NS) for count in periods]))
+    return trajectory.path(np.array([GPS_NS + round(count * PERIOD_NS) for count in periods])).poses()
 
 
 def test_the_first_pose_is_the_origin(trajectory):
@@ -146,6 +146,6 @@ def test_the_last_ten_seconds_at_200_hz_are_kept_and_no_more_than_twice_that():
     last_ns = trajectory.last_ns
     assert last_ns == GPS_NS + (count - 1) * 5_000_000
     ages_s = np.array([0.0, 0.0025, 5.0, 10.0, 25.0])
-    poses = trajectory.at(last_ns - np.round(ages_s * 1e9).astype(np.int64))
+    poses = trajectory.path(last_ns - np.round(ages_s * 1e9).astype(np.int64)).poses()
     assert poses.known.tolist() == [True, True, True, True, False]
     assert poses.position_m[:4, 0] == pytest.approx((count - 1) * 0.01 - ages_s[:4] * 2.0, abs=1e-3)
