@@ -23,7 +23,7 @@ from polecal.daemon.choices import Choice
 from polecal.daemon.config import Config
 from polecal.daemon.control import Code, Refused
 from polecal.daemon.facts import Facts
-from polecal.daemon.passes import Kept
+from polecal.daemon.passes import Kept, most_of_one
 from polecal.daemon.past import Past
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.quality import Quality
@@ -78,7 +78,7 @@ def resume(folder: Path, config: Config) -> tuple[Session, Past]:
     """Give the next day of a session, and what it starts from.
 
     Raises SessionError, and Refused where the configuration is not the session's: its passes would be
-    judged by another one than they were made with.
+    judged by another one than they were made with; or where there may be no more of them.
     """
     metadata, before = told(folder)
     differ = list(_differences(before.model_dump(), config.model_dump()))
@@ -89,6 +89,13 @@ def resume(folder: Path, config: Config) -> tuple[Session, Past]:
             Code.CONFIG,
         )
     past = past_of(folder)
+    most = config.routine.max_passes
+    if full := [name for name, passes in past.passes.items() if most_of_one(passes) >= most]:
+        raise Refused(
+            f"session {folder.name} has all of the {most} passes of {' and '.join(full)} that it may have",
+            "begin a new session: what these did not tell, more of the same will not",
+            Code.USAGE,
+        )
     return Session(folder, metadata["created"], past.site + 1), past
 
 

@@ -271,6 +271,8 @@ class Routine(_Part):
     """So many passes in each slice."""
     slices_needed: Annotated[int, Field(ge=1)] = 12
     """So many slices must have them."""
+    max_passes: Annotated[int, Field(ge=1, le=1000)] = 200
+    """After so many passes of a reflector, of all days together, a run ends with what there is."""
 
     @field_validator("slice_deg")
     @classmethod
@@ -286,6 +288,14 @@ class Routine(_Part):
         if slice_deg is not None and slices_needed > 360 // slice_deg:
             raise _fault(f"{slices_needed} of only {360 // slice_deg} slices of {slice_deg}°")
         return slices_needed
+
+    @field_validator("max_passes")
+    @classmethod
+    def _no_fewer_than_each_slice_needs(cls, max_passes: int, info: ValidationInfo) -> int:
+        min_passes = info.data.get("min_passes")
+        if min_passes is not None and max_passes < min_passes:
+            raise _fault(f"{max_passes} passes in all, but each slice needs {min_passes}")
+        return max_passes
 
 
 class MaxSigma(_Part):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -48,6 +50,14 @@ class Kept:
             for kind, of in self.moments.totals.items()
         }
         return replace(self, moments=replace(self.moments, totals=totals))
+
+
+def most_of_one(passes: Iterable[Kept]) -> int:
+    """Count the passes of each day's reflector of which there are most: the pole, but for odd days."""
+    busiest: dict[int, int] = {}
+    for (site, _), count in Counter(one.where for one in passes).items():
+        busiest[site] = max(count, busiest.get(site, 0))
+    return sum(busiest.values())
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.control import Code, Refused
 from polecal.daemon.fusion import LaserChannel
 from polecal.daemon.navigation import Navigation, OnPose, name_of
-from polecal.daemon.passes import Kept, StoredPass
+from polecal.daemon.passes import Kept, StoredPass, most_of_one
 from polecal.daemon.passing import Passing
 from polecal.daemon.past import Past
 from polecal.daemon.pulse import Pulse
@@ -120,7 +120,7 @@ class _LaserRun:
         if not passes:
             return  # what was thin from one side has turned out to be a plate, or all were dropped
         with suppress(CalibrationError):
-            self.alone = self.result = estimate(passes, self.setup, everywhere=everywhere)
+            self.alone = self.result = self._ended(estimate(passes, self.setup, everywhere=everywhere))
             if len(self._config.lasers) > 1:
                 spans_ns = [one.facts.gps_ns for one in kept]
                 self.view = View.of(self.name, passes, spans_ns, self.setup, self.result)
@@ -128,6 +128,21 @@ class _LaserRun:
             # One pass over level ground may put the laser anywhere; what is placed by that is lost.
             if self._could_be(self.result.mount):
                 self.channel.mount = self.result.mount
+
+    @property
+    def full(self) -> bool:
+        """Whether there are as many passes as there may be, dropped or not."""
+        return most_of_one(self.passes) >= self._config.routine.max_passes
+
+    def _ended(self, result: Result) -> Result:
+        """Give a result that is to get no more passes as one: if they were not enough, more are not."""
+        verdict = result.verdict
+        if verdict.accepted or not self.full:
+            return result
+        reason = (
+            f"{most_of_one(self.passes)} passes, and still not good enough: more of the same will not help"
+        )
+        return replace(result, verdict=Verdict(False, (*verdict.reasons, reason), True))
 
     def passing(self) -> dict[str, Any] | None:
         """Tell of the pass of the pole that is being driven, None where there is none."""
@@ -515,6 +530,8 @@ class Pipeline:
         verdicts = [laser.result.verdict for laser in self._lasers.values() if laser.result is not None]
         if len(verdicts) == len(self._lasers) and all(verdict.accepted for verdict in verdicts):
             self.finish(t_ns, "the criteria are met")
+        elif full := [laser.name for laser in self._lasers.values() if laser.full]:
+            self.finish(t_ns, f"{' and '.join(full)}: all {self._need.max_passes} passes that there may be")
         elif any(verdict.hopeless for verdict in verdicts):
             self.finish(t_ns, "more of the same driving would not help")
 

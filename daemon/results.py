@@ -44,7 +44,7 @@ def setup_of(config: Config, laser: Laser) -> Setup:
                 *(float(np.radians(angle)) for angle in (most.roll_deg, most.pitch_deg, most.yaw_deg)),
             ),
         ),
-        need=Need(**config.routine.model_dump()),
+        need=Need(**config.routine.model_dump(exclude={"max_passes"})),
     )
 
 

@@ -148,7 +148,7 @@ def _config(folder: Path, lasers: int) -> dict:
         ],
         "navigation": {"port": str(folder / SPAN)},
         "pole": {"radius_m": 0.04, "height_m": 2.4},
-        "routine": {"min_passes": 99},
+        "routine": {"min_passes": 99, "max_passes": 1000},
     }
 
 

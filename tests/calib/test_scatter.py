@@ -1,11 +1,12 @@
 """Sums that are looked at a few passes at a time, wherever they are, against all of them at once."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from polecal.calib.estimate import passes_of, scatters_of
+from polecal.calib.estimate import Setup, estimate, passes_of, scatters_of
 from polecal.calib.observations import Kind
 from polecal.calib.report.rig import Rig, drive
 from polecal.calib.solve import Scatter, ground_basis, ground_rows, pole_basis, pole_rows
@@ -60,6 +61,24 @@ def test_each_pass_is_as_it_is_by_itself(seen):
         single = np.concatenate([getattr(one.along(basis, 0.3), name) for one in alone])
         np.testing.assert_allclose(getattr(whole, name), single, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(every.within(rows), np.concatenate([one.within(rows) for one in alone]))
+
+
+def test_a_solution_takes_little_memory_for_each_pass(passes, rig, tell):
+    """The matrices of a pass, of its pole and its ground, are 160 kB."""
+    many = [replace(one, id=one.id + P * turn) for turn in range(4) for one in passes]
+    setup = Setup(rig.measured, pole_radius_m=RADIUS_M)
+    peaks_kb = []
+    for some in (passes, passes, many):  # what is made once is there after the first
+        tracemalloc.start()
+        try:
+            result = estimate(some, setup)
+            peaks_kb.append(tracemalloc.get_traced_memory()[1] / 1e3)
+        finally:
+            tracemalloc.stop()
+        assert result.left_out_m is not None
+    a_pass_kb = (peaks_kb[2] - peaks_kb[1]) / (len(many) - P)
+    tell(f"{peaks_kb[2]:.0f} kB for {len(many)} passes, {a_pass_kb:.1f} for each more")
+    assert a_pass_kb < 30
 
 
 def test_sums_that_are_kept_elsewhere_are_fetched_and_count_the_same(passes):

@@ -3,6 +3,7 @@
 import os
 import shutil
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,15 @@ import pytest
 import yaml
 
 from polecal.daemon import archive, sessions
+from polecal.daemon import pipeline as pipelines
 from polecal.daemon.config import Config
 from polecal.daemon.control import Code, Refused
+from polecal.daemon.passes import most_of_one
 from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Recorder
 from polecal.daemon.replay import BEGIN, CHOICE, FINISH, replay
 from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, SessionError, captures_of
+from polecal.daemon.spill import Spill
 from polecal.daemon.transfer import export_dumps
 from polecal.drivers.emulated.world import demo_world
 
@@ -174,6 +178,32 @@ def test_with_another_configuration_a_session_is_not_gone_on_with(recorded, sett
         archive.resume(recorded.session.folder, settings(**{key: value}))
     assert caught.value.code == Code.CONFIG
     assert "session.yaml" in caught.value.hint
+
+
+def test_passes_of_all_days_together_are_as_many_as_there_may_be(days, settings, tmp_path):
+    config = settings(state_dir=str(tmp_path / "state"), routine={"max_passes": 7})
+    first = sessions.create(config.state_dir, config, "two days")
+    earlier = day(config, first, None, days[0][: len(days[0]) // 2])
+    assert 0 < len(earlier.passes()) < 7
+    session, past = archive.resume(first.folder, config)
+    pipeline = day(config, session, past, days[1])
+    assert most_of_one(pipeline._lasers["front"].passes) == 7
+    reasons = pipeline.calibration()["lasers"][0]["verdict"]["reasons"]
+    assert any("7 passes, and still not" in reason for reason in reasons)
+    with pytest.raises(Refused, match="all of the 7 passes of front") as caught:
+        archive.resume(first.folder, config)
+    assert "begin a new session" in caught.value.hint
+
+
+def test_with_all_sums_on_the_disk_both_days_come_to_the_same(resumed, tmp_path, monkeypatch):
+    for module in (archive, pipelines):
+        monkeypatch.setattr(module, "Spill", partial(Spill, in_memory_bytes=0))
+    replay(resumed.folder, None, tmp_path / "out", None)
+    assert (tmp_path / "out" / CALIBRATION).read_bytes() == resumed.calibration()
+    (front,) = archive.past_of(resumed.folder).passes.values()
+    assert all(callable(of.held) for one in front for of in one.moments.totals.values())
+    _, reopened = archive.reopen(resumed.folder)
+    assert reopened.calibration()["lasers"] == resumed.second.calibration()["lasers"]
 
 
 def test_with_other_ports_and_folders_it_is(recorded, settings, tmp_path):

@@ -42,6 +42,7 @@ def test_only_ports_mount_and_pole_are_needed():
     assert (loaded.navigation.baud, loaded.navigation.rate_hz) == (230400, 100)
     assert (loaded.routine.slice_deg, loaded.routine.slices_needed) == (30, 12)
     assert (loaded.routine.min_pole_returns, loaded.routine.min_passes) == (100, 1)
+    assert loaded.routine.max_passes == 200
     assert (loaded.accept.cost_m, loaded.accept.improvement, loaded.accept.mode) == (0.05, 0.02, "all")
     assert (loaded.accept.max_sigma.xy_m, loaded.accept.max_sigma.yaw_deg) == (0.02, 0.1)
 
@@ -100,6 +101,8 @@ def test_all_faults_come_at_once_each_with_its_path():
         ("pole:", "routine: {slice_deg: 50}\npole:", "routine.slice_deg"),
         ("pole:", "routine: {slice_deg: 45}\npole:", "routine.slices_needed"),
         ("pole:", "routine: {min_passes: 0}\npole:", "routine.min_passes"),
+        ("pole:", "routine: {min_passes: 9, max_passes: 8}\npole:", "routine.max_passes"),
+        ("pole:", "routine: {max_passes: 1001}\npole:", "routine.max_passes"),
         ("pole:", "accept: {mode: most}\npole:", "accept.mode"),
         ("pole:", "accept: {max_sigma: {yaw_deg: 0}}\npole:", "accept.max_sigma.yaw_deg"),
         ("pole:", "lasers: []\npole:", "line 6, column 1"),

@@ -1,5 +1,6 @@
 """Chunks to calibrations: what a run comes to, and what it says on the way."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -292,6 +293,28 @@ def test_a_hand_measurement_that_cannot_be_right_is_a_reason_and_ends_the_run(be
     laser["mount_sigma"]["rpy_deg"] = 1.0
     played = begun(settings(laser=laser, routine={"slices_needed": 6})).feed(drive.until(100.0))
     assert_hopeless(played, "yaw", "from the hand measurement")
+
+
+def test_a_run_ends_with_as_many_passes_as_there_may_be_and_says_so(begun, settings, drive):
+    played = begun(settings(routine={"max_passes": 5})).feed(drive.chunks)
+    assert played.states[-2:] == [State.CALIBRATING, State.REJECTED]
+    assert played.transitions[-2][3] == "front: all 5 passes that there may be"
+    assert max(Counter(row["place"] for row in played.pipeline.passes()).values()) == 5
+    (reason,) = [one for one in played.laser()["verdict"]["reasons"] if "more of the same" in one]
+    assert reason.startswith("5 passes, and still not good enough")
+    assert reason in played.transitions[-1][3]
+    assert any("no pass" in one for one in played.laser()["verdict"]["reasons"])
+    played.pipeline.choose(played.last_ns, played.pipeline.choice("2", drop=True, by="ann", at="2026-11-22"))
+    assert reason in played.laser()["verdict"]["reasons"]  # no other is driven in its place
+
+
+def test_passes_that_make_a_result_good_count_though_there_may_be_no_more(begun, settings, drive):
+    accepted = begun(settings()).feed(drive.chunks)
+    assert accepted.state is State.ACCEPTED
+    most = max(Counter(row["place"] for row in accepted.pipeline.passes()).values())
+    played = begun(settings(routine={"max_passes": most})).feed(drive.chunks)
+    assert played.state is State.ACCEPTED
+    assert played.laser()["verdict"]["reasons"] == []
 
 
 def assert_hopeless(played, *words):
