@@ -131,6 +131,14 @@ def judge(
     return Verdict(not reasons, reasons, hopeless)
 
 
+def given_up(verdict: Verdict, passes: int) -> Verdict:
+    """Give the verdict on so many passes that there may be no more: if they are not enough, that is that."""
+    if verdict.accepted:
+        return verdict
+    why = f"{passes} passes, and still not good enough: more of the same will not help"
+    return Verdict(False, (*verdict.reasons, why), hopeless=True)
+
+
 def _slices(slices: Sequence[int]) -> str:
     names = ", ".join(map(str, slices))
     return f"slices {names} have" if len(slices) > 1 else f"slice {names} has"

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from polecal.calib import CalibrationError, Mount, Pass, Result, Verdict, estimate, residuals
+from polecal.calib.acceptance import given_up
 from polecal.calib.agreement import View, disagreements
 from polecal.calib.coverage import headings
 from polecal.calib.geometry import wrap
@@ -76,7 +77,7 @@ class _LaserRun:
         self.dropped: dict[int, Choice] = {}
         """Passes that the operator does not want, by id."""
         self._calibrated: list[Pass] = []
-        self._config, self._laser = config, laser
+        self._config, self._laser, self._most = config, laser, config.routine.max_passes
         self._earlier_poles: set[tuple[int, int]] = set()
         self.anew(0, trajectory, gps_clock)
 
@@ -120,7 +121,10 @@ class _LaserRun:
         if not passes:
             return  # what was thin from one side has turned out to be a plate, or all were dropped
         with suppress(CalibrationError):
-            self.alone = self.result = self._ended(estimate(passes, self.setup, everywhere=everywhere))
+            found = estimate(passes, self.setup, everywhere=everywhere)
+            if self.full:
+                found = replace(found, verdict=given_up(found.verdict, self._most))
+            self.alone = self.result = found
             if len(self._config.lasers) > 1:
                 spans_ns = [one.facts.gps_ns for one in kept]
                 self.view = View.of(self.name, passes, spans_ns, self.setup, self.result)
@@ -132,17 +136,7 @@ class _LaserRun:
     @property
     def full(self) -> bool:
         """Whether there are as many passes as there may be, dropped or not."""
-        return most_of_one(self.passes) >= self._config.routine.max_passes
-
-    def _ended(self, result: Result) -> Result:
-        """Give a result that is to get no more passes as one: if they were not enough, more are not."""
-        verdict = result.verdict
-        if verdict.accepted or not self.full:
-            return result
-        reason = (
-            f"{most_of_one(self.passes)} passes, and still not good enough: more of the same will not help"
-        )
-        return replace(result, verdict=Verdict(False, (*verdict.reasons, reason), True))
+        return most_of_one(self.passes) >= self._most
 
     def passing(self) -> dict[str, Any] | None:
         """Tell of the pass of the pole that is being driven, None where there is none."""

@@ -154,6 +154,7 @@ def test_the_numbers_of_the_verdict_are_the_defaults():
     most = accept.max_sigma
     assert {100 * most.xy_m, 100 * most.z_m} == {xyz_cm}
     assert {most.roll_deg, most.pitch_deg, most.yaw_deg} == {angle_deg}
+    assert f"after {loads(yaml.safe_dump(SMALLEST)).routine.max_passes} passes" in README
 
 
 def test_other_numbers_are_the_codes():
@@ -185,7 +186,7 @@ def everything_wrong():
         shift=np.ones(6),
         measured_sigma=np.full(6, 0.1),
     )
-    return verdict.reasons
+    return acceptance.given_up(verdict, 200).reasons
 
 
 def test_what_the_verdict_says_is_told_with_what_to_do():
