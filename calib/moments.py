@@ -61,7 +61,7 @@ class Moments:
     def _with(self, other: Moments, sign: int) -> Moments:
         one, two = self, other
         if not np.array_equal(one.features, two.features):
-            both = np.union1d(one.features, two.features)
+            both = _features_of(np.union1d(one.features, two.features).tobytes())
             one, two = one.over(both), two.over(both)
         return Moments(
             one.count + sign * two.count,
@@ -121,6 +121,12 @@ def alike(parts: Sequence[Moments]) -> list[Moments]:
 
 
 @cache
+def _features_of(numbers: bytes) -> NDArray[np.int64]:
+    """Give features (K,) of the bytes of their numbers: for hundreds of passes that are alike one array."""
+    return np.frombuffer(numbers, dtype=np.int64)
+
+
+@cache
 def upper(width: int) -> NDArray[np.int64]:
     """Give where the upper triangle is in a matrix (K, K), flat."""
     row, column = np.triu_indices(width)
@@ -162,7 +168,7 @@ def by_group(
         index, group = index[order], group[order]
     parts = [BASE, *[RANGE] * ranged, *[TIME, TIME_SQUARED] * (timed and returns.motion is not None)]
     of_axis = np.concatenate([np.arange(WIDTH)[part] for part in parts])
-    summed = (WIDTH * np.array(sorted(axes))[:, None] + of_axis).ravel()
+    summed = _features_of((WIDTH * np.array(sorted(axes))[:, None] + of_axis).tobytes())
     sums: dict[int, tuple[int, Array | float, Array | float]] = {}
     size = _BLOCK // len(summed)
     for start in range(0, len(index), size):
