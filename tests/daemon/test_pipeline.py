@@ -300,7 +300,7 @@ def test_a_run_ends_with_as_many_passes_as_there_may_be_and_says_so(begun, setti
     assert played.states[-2:] == [State.CALIBRATING, State.REJECTED]
     assert played.transitions[-2][3] == "front: all 5 passes that there may be"
     assert max(Counter(row["place"] for row in played.pipeline.passes()).values()) == 5
-    (reason,) = [one for one in played.laser()["verdict"]["reasons"] if "more of the same" in one]
+    (reason,) = [one for one in played.laser()["verdict"]["reasons"] if "still not good enough" in one]
     assert reason.startswith("5 passes, and still not good enough")
     assert reason in played.transitions[-1][3]
     assert any("no pass" in one for one in played.laser()["verdict"]["reasons"])
