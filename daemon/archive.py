@@ -93,7 +93,7 @@ def resume(folder: Path, config: Config) -> tuple[Session, Past]:
     if full := [name for name, passes in past.passes.items() if most_of_one(passes) >= most]:
         raise Refused(
             f"session {folder.name} has all of the {most} passes of {' and '.join(full)} that it may have",
-            "begin a new session: what these did not tell, more of the same will not",
+            "begin a new session; the verdict of this one says what to mend first",
             Code.USAGE,
         )
     return Session(folder, metadata["created"], past.site + 1), past

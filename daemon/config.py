@@ -271,7 +271,7 @@ class Routine(_Part):
     """So many passes in each slice."""
     slices_needed: Annotated[int, Field(ge=1)] = 12
     """So many slices must have them."""
-    max_passes: Annotated[int, Field(ge=1, le=1000)] = 200
+    max_passes: Annotated[int, Field(ge=1, le=500)] = 200
     """After so many passes of a reflector, of all days together, a run ends with what there is."""
 
     @field_validator("slice_deg")

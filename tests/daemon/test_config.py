@@ -102,7 +102,7 @@ def test_all_faults_come_at_once_each_with_its_path():
         ("pole:", "routine: {slice_deg: 45}\npole:", "routine.slices_needed"),
         ("pole:", "routine: {min_passes: 0}\npole:", "routine.min_passes"),
         ("pole:", "routine: {min_passes: 9, max_passes: 8}\npole:", "routine.max_passes"),
-        ("pole:", "routine: {max_passes: 1001}\npole:", "routine.max_passes"),
+        ("pole:", "routine: {max_passes: 501}\npole:", "routine.max_passes"),
         ("pole:", "accept: {mode: most}\npole:", "accept.mode"),
         ("pole:", "accept: {max_sigma: {yaw_deg: 0}}\npole:", "accept.max_sigma.yaw_deg"),
         ("pole:", "lasers: []\npole:", "line 6, column 1"),
