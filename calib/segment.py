@@ -7,6 +7,7 @@ from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import compress, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,35 +54,39 @@ def reflectors(
     meets may go on beyond: the part that is seen of a pole is not where the whole pole is.
     """
     bright = np.flatnonzero((reflectivity >= RETRO_REFLECTIVE) & np.isfinite(range_m))
-    if not len(bright):
-        return []
+    numbers, ranges_m = (
+        bright.tolist(),
+        range_m[bright].tolist(),
+    )  # few: lists take less time
     step_rad = abs(float(bearing_rad[1] - bearing_rad[0]))
     found = []
-    for together in _together(bright, range_m[bright]):
-        if together[0] == 0 or together[-1] == len(range_m) - 1:
+    for part in _together(numbers, ranges_m):
+        first, last, of_part_m = numbers[part][0], numbers[part][-1], ranges_m[part]
+        if first == 0 or last == len(range_m) - 1:
             continue
-        beams, ranges_m = together, range_m[together]
-        distance_m = float(ranges_m.mean())
-        width_m = distance_m * (abs(float(bearing_rad[beams[-1]] - bearing_rad[beams[0]])) + step_rad)
+        beams, distance_m = bright[part], sum(of_part_m) / len(of_part_m)
+        width_m = distance_m * (abs(float(bearing_rad[last] - bearing_rad[first])) + step_rad)
         widest_m = 2 * pole_radius_m + _SPREAD_BEAMS * step_rad * distance_m + _SPREAD_M
         thin = width_m <= widest_m
         if thin:  # a beam on its edge sees half of it and half of what is behind, at a range between
-            core_m = sorted(ranges_m.tolist())[(len(beams) - 1) // 2]
-            core = np.abs(ranges_m - core_m) <= pole_radius_m + _BEHIND_M
-            beams, distance_m = beams[core], float(ranges_m[core].mean())
+            core_m = sorted(of_part_m)[(len(of_part_m) - 1) // 2]
+            core = [abs(each_m - core_m) <= pole_radius_m + _BEHIND_M for each_m in of_part_m]
+            if not all(core):
+                beams = beams[np.array(core)]
+                of_core_m = list(compress(of_part_m, core))
+                distance_m = sum(of_core_m) / len(of_core_m)
         found.append(Reflector(beams, distance_m, thin))
     return found
 
 
-def _together(bright: Indices, range_m: Array) -> list[Indices]:
-    """Part bright beams (N,) at (N,) ranges into those that lie beside one another."""
-    numbers, ranges_m = bright.tolist(), range_m.tolist()  # a few: lists take a quarter of arrays' time
+def _together(numbers: Sequence[int], ranges_m: Sequence[float]) -> list[slice]:
+    """Part bright beams, by their numbers and ranges, into those that lie beside one another."""
     starts = [
         at
         for at in range(1, len(numbers))
         if numbers[at] - numbers[at - 1] > _MARGIN_BEAMS or abs(ranges_m[at] - ranges_m[at - 1]) > _STEP_M
     ]
-    return [bright[begin:end] for begin, end in zip([0, *starts], [*starts, len(numbers)], strict=True)]
+    return [slice(*ends) for ends in pairwise([0, *starts, len(numbers)])] if numbers else []
 
 
 @dataclass(slots=True)

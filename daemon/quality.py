@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import groupby
 from typing import NamedTuple
 
 from polecal.drivers.novatel_span import Accuracy, InsStatus, PositionType
@@ -68,8 +69,9 @@ class QualityLog:
         status = max(
             (pose.ins_status for pose in poses), key=lambda said: said != InsStatus.INS_SOLUTION_GOOD
         )
-        types = [pose.position_type for pose in poses if pose.position_type is not None]
-        told = [pose.accuracy for pose in poses if pose.accuracy is not None]
+        # Both stay as they are for many poses: each is looked at once.
+        types = [said for said, _ in groupby(pose.position_type for pose in poses) if said is not None]
+        told = [said for said, _ in groupby(pose.accuracy for pose in poses) if said is not None]
         return Quality(
             ins_status=_name(status),
             position_type=_name(max(types, key=_rank)) if types else None,
