@@ -278,10 +278,13 @@ class Pipeline:
             self._navigation.tick(t_ns)
         else:
             return
-        if before is not _COLLECTING or self._navigation.lost:
+        settled = before is _COLLECTING and not self._navigation.lost
+        if settled and not framed:
+            return  # as with most chunks: nothing is there that was not before
+        if not settled:
             self._advance(t_ns)
         news = self.routine.state is not before
-        for laser in self._lasers.values() if framed else ():  # else nothing is there that was not before
+        for laser in self._lasers.values() if framed else ():
             for stored in laser.channel.fuse():
                 self._take(laser, stored)
                 news = True
