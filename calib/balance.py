@@ -33,11 +33,11 @@ def balance(near: Subsets, without: NDArray[np.bool_], known: Array, most: float
     pole, ground = near.sides(without)
     beforehand = np.diag(known[near.free])
     tried = most ** np.linspace(0.0, 1.0, _TRIED)
-    logs = []
-    for one in tried:
-        gradient, information = (of_pole + one * of for of_pole, of in zip(pole, ground, strict=True))
-        steps = np.zeros((len(without), len(UNKNOWNS)))
-        steps[:, near.free] = -np.linalg.solve(information + beforehand, gradient[:, :, None])[:, :, 0]
-        scatter = np.diag(jackknife(steps))[: len(PARAMETERS)]
-        logs.append(np.log(np.maximum(scatter, _NOTHING)).sum())
-    return float(tried[np.flatnonzero(logs <= min(logs) + _NEARLY)[-1]])
+    gradient, information = (
+        of_pole + tried.reshape(-1, *[1] * of.ndim) * of for of_pole, of in zip(pole, ground, strict=True)
+    )
+    steps = np.zeros((_TRIED, len(without), len(UNKNOWNS)))
+    steps[..., near.free] = -np.linalg.solve(information + beforehand, gradient[..., None])[..., 0]
+    scatter = np.diagonal(jackknife(steps), axis1=1, axis2=2)[:, : len(PARAMETERS)]
+    logs = np.log(np.maximum(scatter, _NOTHING)).sum(axis=1)
+    return float(tried[np.flatnonzero(logs <= logs.min() + _NEARLY)[-1]])

@@ -356,13 +356,16 @@ class _Found:
     vector: Array
     covariance: Array
     held: frozenset[str]
+    paper: Form
+    """Eq. 7 of the used passes,"""
     form: Form
-    bend: Array
-    """`Form.bend` near the minimum."""
-    subsets: Subsets | None
-    """The passes near the minimum; None where there are too few."""
-    left_out: Array | None
-    """(U, 12) without each used pass, or None where there are too few."""
+    """and what was minimised."""
+    subsets: Subsets | None = None
+    """The passes near the minimum; None where there are too few, as with all below."""
+    left_out: Array | None = None
+    """(U, 12) without each used pass."""
+    parts: Array | None = None
+    """(3, 12) of `_Problem._parts`."""
 
 
 class _Problem:
@@ -405,7 +408,7 @@ class _Problem:
             whole = replace(whole, balance=less * whole.balance)
         search = solve.minimise_globally if everywhere else solve.minimise
         at_measured = whole.information(measured)
-        vector, bend = about, np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
+        vector = about
         while True:
             vector = search(whole, np.where(_mask(held), measured, vector), held)
             free = ~_mask(held)
@@ -416,14 +419,14 @@ class _Problem:
             # too.
             count, information = int(self.pole.count[used].sum()), whole.information(vector)
             best = [np.diag(from_model(of, squared, count, free)) for of in (information, at_measured)]
-            variance, subsets, left_out = np.maximum(*best), None, None
+            variance, subsets, left_out, parts = np.maximum(*best), None, None, None
             if not enough:
                 covariance = from_model(information, squared, len(numbers), free)
                 variance = np.maximum(variance, np.diag(covariance))
             elif (variance <= believable**2).all():
                 subsets = Subsets.near(self.pole, self.ground, weights, vector, free)
-                bend = whole.bend(vector)
-                left_out = subsets.minima(_each_but_one(used), bend)
+                some = np.concatenate([_each_but_one(used), self._parts(used)])
+                left_out, parts = np.split(subsets.minima(some, whole.bend(vector)), [len(numbers)])
                 covariance = jackknife(left_out)
                 variance = np.maximum(variance, np.diag(covariance))
             doubt = np.sqrt(variance) / believable
@@ -433,8 +436,17 @@ class _Problem:
             doubt = np.where(free, np.nan_to_num(doubt, nan=np.inf), 0.0)  # what is no number is not told
             worst = int(np.argmax(doubt))
             if doubt[worst] <= 1.0:
-                return _Found(vector, covariance, frozenset(held), whole, bend, subsets, left_out)
+                return _Found(vector, covariance, frozenset(held), paper, whole, subsets, left_out, parts)
             held.add(UNKNOWNS[worst])
+
+    def _parts(self, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Give the used passes but the last ones, and two halves of them that have seen as much, (3, P)."""
+        order = np.flatnonzero(used).tolist()
+        turned = sorted(order, key=lambda number: min(self._passes[number].pole_returns, default=0))
+        parts = np.zeros((3, len(used)), dtype=bool)
+        for part, numbers in zip(parts, (order[:-_LAST_PASSES], turned[::2], turned[1::2]), strict=True):
+            part[numbers] = True  # of the halves from every heading every other pass
+        return parts
 
     def oddest(self, used: NDArray[np.bool_], vector: Array) -> tuple[int, str] | None:
         """Find the used pass that disagrees most with the others, if any does beyond what they scatter."""
@@ -463,7 +475,6 @@ class _Problem:
     def result(self, used: NDArray[np.bool_], found: _Found, set_aside: dict[int, str]) -> Result:
         """Say what was found, and judge it."""
         setup, vector, held = self._setup, found.vector, found.held
-        paper = self._form(used)  # Eq. 7
         passes = [one for one, is_used in zip(self._passes, used, strict=True) if is_used]
         mask = _mask(held)[:6]
         covariance = found.covariance[:6, :6] + self._not_told(found)
@@ -471,18 +482,11 @@ class _Problem:
         sigma = np.sqrt(np.diag(covariance))
         spread = np.sqrt(np.diag(found.covariance))
         told = [index for index, name in enumerate(UNKNOWNS) if name in EXTRAS and name not in held]
-        cost_m = solve.cost_m(paper, vector)
-        order = np.flatnonzero(used).tolist()
+        cost_m = solve.cost_m(found.paper, vector)
         improvement = doubling = left_out_m = None
-        if found.subsets is not None and found.left_out is not None:
+        if found.subsets is not None and found.left_out is not None and found.parts is not None:
             left_out_m = found.subsets.left_out_m(used, found.left_out)
-        if found.subsets is not None and len(passes) > _LAST_PASSES:
-            # Halves that have seen as much: from every heading every other pass.
-            turned = sorted(order, key=lambda number: min(self._passes[number].pole_returns, default=0))
-            some = np.zeros((3, len(used)), dtype=bool)
-            for row, numbers in zip(some, (order[:-_LAST_PASSES], turned[::2], turned[1::2]), strict=True):
-                row[numbers] = True
-            costs_m = [solve.cost_m(paper, minimum) for minimum in found.subsets.minima(some, found.bend)]
+            costs_m = [solve.cost_m(found.paper, minimum) for minimum in found.parts]
             last, *halves = (part_m / cost_m - 1.0 if cost_m else 0.0 for part_m in costs_m)
             improvement, doubling = last, float(np.mean(halves))
         slices = coverage([one.pole_returns for one in passes], setup.need)
@@ -509,7 +513,7 @@ class _Problem:
             extras={UNKNOWNS[index]: float(vector[index]) for index in told},
             extra_sigma={UNKNOWNS[index]: float(spread[index]) for index in told},
             cost_m=cost_m,
-            measured_cost_m=solve.cost_m(paper, self._measured),
+            measured_cost_m=solve.cost_m(found.paper, self._measured),
             sigma=Mount.of_variance(np.diag(covariance)),
             covariance=covariance,
             held=tuple(name for name in PARAMETERS if name in held),

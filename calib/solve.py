@@ -510,7 +510,7 @@ class Form:
         weights, dweights = _ground_weights(vector)
         down, ground, steeper = _rows(weights, h)[0], self.ground, None
         if self.ray is not None:
-            steeper = self.ray @ _jacobian(weights[0], dweights[0], h, dh) / (down @ self.ray)
+            steeper = self.ray @ _jacobians(weights, dweights, h, dh)[0] / (down @ self.ray)
         if bumps and self.bumps is not None:
             less = float(roughness(down @ self.bumps @ down / self.rough_m2)[1]) - 1.0
             ground = ground + less * self.bumps
@@ -528,20 +528,18 @@ def roughness(rough: Array) -> tuple[Array, Array]:
     return np.log(near) + np.maximum(rough - ROUGHEST, 0.0) / ROUGHEST, 1.0 / near
 
 
-def _jacobian(weight: Array, dweight: Array, h: Array, dh: Array) -> Array:
-    """Give the derivative (108, 12) of an axis's row, so weighted."""
-    return (weight[:, None, None] * dh + dweight[:, None] * h[:, None]).reshape(3 * WIDTH, -1)
+def _jacobians(weights: Array, dweights: Array, h: Array, dh: Array) -> Array:
+    """Give the derivatives (k, 108, 12) of k axes' rows, so weighted."""
+    slopes = weights[:, :, None, None] * dh + dweights[:, :, None] * h[:, None]
+    jacobians: Array = slopes.reshape(len(weights), 3 * WIDTH, -1)
+    return jacobians
 
 
 def _half_slope(matrix: Array, weights: Array, dweights: Array, h: Array, dh: Array) -> tuple[Array, Array]:
     """Give half the gradient (12,) and half the Gauss-Newton Hessian (12, 12) of one kind's variances."""
-    gradient, hessian = np.zeros(len(UNKNOWNS)), np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
-    for weight, dweight in zip(weights, dweights, strict=True):
-        jacobian = _jacobian(weight, dweight, h, dh)
-        pulled = matrix @ jacobian
-        gradient += pulled.T @ np.outer(weight, h).ravel()
-        hessian += jacobian.T @ pulled
-    return gradient, hessian
+    jacobians = _jacobians(weights, dweights, h, dh)
+    pulled = (matrix @ jacobians).reshape(-1, len(UNKNOWNS))
+    return _rows(weights, h).ravel() @ pulled, jacobians.reshape(-1, len(UNKNOWNS)).T @ pulled
 
 
 def cost_m(form: Form, vector: Array) -> float:
@@ -572,8 +570,7 @@ def ground_basis(vector: Array) -> Array:
 def _basis(weights: Array, dweights: Array, vector: Array) -> Array:
     h = _h(vector)
     dh = _h_gradient(vector, h)
-    slopes = [_jacobian(weight, dweight, h, dh) for weight, dweight in zip(weights, dweights, strict=True)]
-    return np.concatenate([_rows(weights, h)[:, :, None], np.stack(slopes)], axis=2)
+    return np.concatenate([_rows(weights, h)[:, :, None], _jacobians(weights, dweights, h, dh)], axis=2)
 
 
 def _rows(weights: Array, h: Array) -> Array:

@@ -16,15 +16,16 @@ FEWEST_PASSES = 4
 
 
 def jackknife(left_out: Array) -> Array:
-    """Give the covariance (n, n) of the whole, from (P, n) solutions each without one of P passes.
+    """Give the covariances (..., n, n) of the whole, from (..., P, n) solutions each without one of P passes.
 
     Tukey's (P-1)/P Σ d dᵀ, d from the mean; unknowns 3 to 5 are angles in rad, compared the short way
     round.
     """
-    spread = left_out - left_out[0]
-    spread[:, 3:6] = wrap(spread[:, 3:6])
-    spread -= spread.mean(axis=0)
-    covariance: Array = (len(left_out) - 1) / len(left_out) * spread.T @ spread
+    passes = left_out.shape[-2]
+    spread = left_out - left_out[..., :1, :]
+    spread[..., 3:6] = wrap(spread[..., 3:6])
+    spread -= spread.mean(axis=-2, keepdims=True)
+    covariance: Array = (passes - 1) / passes * spread.swapaxes(-2, -1) @ spread
     return covariance
 
 
