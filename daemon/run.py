@@ -26,7 +26,6 @@ from polecal.daemon.route import Stand
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.sessions import CALIBRATION, Session, SessionError
 from polecal.daemon.space import MAKE_ROOM, Space
-from polecal.daemon.urgent import urgently
 from polecal.daemon.writer import Writer
 from polecal.drivers.device import Device
 from polecal.drivers.errors import DeviceError, DeviceProtocolError
@@ -152,7 +151,7 @@ class Run:
                 self._pipeline.begin(now_ns, self._past)
             undo.pop_all()
         for device, port in zip(self._devices, ports, strict=True):
-            reading = threading.Thread(target=urgently, args=(device.run, port), name=device.name)
+            reading = threading.Thread(target=device.run, args=(port,), name=device.name)
             self._threads.append(reading)
         self._writer.start()
         for thread in (*self._threads, self._engine):

@@ -17,11 +17,8 @@ from polecal.drivers.port import Chunk, Port, Stopped, Tap
 State = Literal["closed", "connecting", "streaming", "lost"]
 OpenPort = Callable[[str, int, Tap, threading.Event], Port]
 
-_READ_S = 0.2
 _RETRY_S = 1.0
-_TOGETHER_NS = (
-    100_000_000  # of a stream: each chunk by itself takes ten times as long to hear as many at once
-)
+_TOGETHER_S = 0.1  # of a stream: each chunk by itself takes ten times as long to hear as many at once
 
 
 class Device(ABC):
@@ -92,19 +89,11 @@ class Device(ABC):
             self._set_up(port)
             self.state, self.problem = "streaming", None
             self._log.info("streaming", identity=self.identity, baud=port.baud)
-            heard_s = time.monotonic()
-            unheard: list[Chunk] = []
-            while True:
-                chunk = port.read(_READ_S)
-                if chunk is not None:
-                    unheard.append(chunk)
-                    if chunk.t_ns - unheard[0].t_ns < _TOGETHER_NS:
-                        continue
-                if any([self._heard(each) for each in unheard]):
+            heard_s = looked_s = time.monotonic()
+            while looked_s - heard_s < self.silence_s:
+                looked_s = port.looked_s  # what had come by then is among what is gathered now
+                if any([self._heard(chunk) for chunk in port.gather(_TOGETHER_S)]):
                     heard_s = time.monotonic()
-                elif time.monotonic() - heard_s >= self.silence_s:  # asked only once what waited was read
-                    break
-                unheard.clear()
             raise DeviceProtocolError(
                 f"{self.name} on {port.path}: no whole frame for {self.silence_s:.0f} s",
                 "check its power and cable; it is being set up again",

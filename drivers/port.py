@@ -2,7 +2,8 @@
 
 Every chunk, both ways, goes to the tap before anybody else sees it, so that what is recorded is what was
 on the wire. A chunk is stamped right after ``os.read`` returns: ``select`` and ``os.read`` stamp within
-0.1 ms, where a ``read(n)`` with a time-out stamps tens of milliseconds late.
+0.1 ms, where a ``read(n)`` with a time-out stamps tens of milliseconds late. The thread that does it does
+nothing else: whoever hears the chunks may take his time.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import queue
 import select
 import termios
 import threading
@@ -28,14 +30,17 @@ from polecal.drivers.errors import (
     DeviceNotFound,
     DeviceNotPermitted,
 )
+from polecal.drivers.urgent import urgently
 
 Direction = Literal["rx", "tx"]
 Tap = Callable[[Direction, int, bytes], None]
-"""Takes (direction, CLOCK_MONOTONIC ns, bytes) of every chunk; called from the thread that uses the port."""
+"""Takes (direction, CLOCK_MONOTONIC ns, bytes) of every chunk; of those that were read, in their order."""
 
 _READ_BYTES = 4096  # more than one read ever finds: 17 kB a pty's whole buffer, 4 kB a tty's
 _WAIT_S = 0.2  # how long a read goes without looking whether it should stop
 _WRITE_S = 2.0  # a line that takes no bytes for so long is lost
+_UNHEARD = 50_000  # chunks, minutes of them; those beyond it are recorded, and heard by nobody
+_STUCK_S = 5 * _WAIT_S
 BITS_PER_BYTE = 10  # 8N1
 
 
@@ -58,10 +63,11 @@ def _no_beat() -> None: ...
 
 
 class Port:
-    """One serial line, opened for this process alone.
+    """One serial line, opened for this process alone, and read from then on.
 
     ``stop``, once set, makes the next ``read`` raise `Stopped`; clear it to say goodbye to the device.
-    ``beat`` is called several times a second while somebody reads, also in a silence.
+    ``beat`` is called several times a second while somebody waits for chunks, also in a silence, unless the
+    thread that reads them is stuck. ``looked_s`` is when that last had nothing left to read.
     """
 
     def __init__(
@@ -86,6 +92,12 @@ class Port:
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)
         with contextlib.suppress(ValueError, OSError, NotImplementedError):  # only some UARTs can
             self._serial.set_low_latency_mode(True)
+        self.looked_s = time.monotonic()
+        self._unheard: queue.SimpleQueue[Chunk | Exception] = queue.SimpleQueue()
+        self._taking = threading.Lock()
+        self._closing, self._closed = os.eventfd(0), False
+        self._reader = threading.Thread(target=urgently, args=(self._take,), name=path, daemon=True)
+        self._reader.start()
 
     def __enter__(self) -> Self:
         return self
@@ -106,7 +118,9 @@ class Port:
         try:
             termios.tcdrain(self._fd)
             self._serial.baudrate = baud
-            termios.tcflush(self._fd, termios.TCIFLUSH)
+            with self._taking:
+                termios.tcflush(self._fd, termios.TCIFLUSH)
+                self._waiting()
         except ValueError as error:
             raise DeviceError(
                 f"{self.path}: this adapter cannot do {baud} bit/s: {error}",
@@ -121,30 +135,63 @@ class Port:
         Raises Stopped, DeviceLost.
         """
         deadline_s = time.monotonic() + timeout_s
-        empty = False
         while True:
-            self._beat()
-            if self.stop.is_set():
-                raise Stopped
+            self._look_up()
             left_s = max(0.0, deadline_s - time.monotonic())
-            try:
-                ready, _, _ = select.select([self._fd], [], [], min(left_s, _WAIT_S))
-                data = os.read(self._fd, _READ_BYTES) if ready else b""
-            except BlockingIOError:
-                continue
-            except (OSError, ValueError, termios.error) as error:
-                raise self._lost(error) from error
-            t_ns = time.monotonic_ns()
-            if data:
-                self._tap("rx", t_ns, data)
-                return Chunk(t_ns, data)
-            if ready and not empty:  # somebody else may have read it
-                empty = True
-                continue
-            if ready:  # readable again, and again nothing there: hung up
-                raise self._lost(OSError(errno.EIO, os.strerror(errno.EIO)))
+            with contextlib.suppress(queue.Empty):
+                return self._whole(self._unheard.get(timeout=min(left_s, _WAIT_S)))
             if left_s <= _WAIT_S:
                 return None
+
+    def gather(self, seconds: float) -> list[Chunk]:
+        """Let so much time pass, and return all that came: many chunks at once are cheaper to hear.
+
+        Raises Stopped, DeviceLost.
+        """
+        self.stop.wait(seconds)
+        self._look_up()
+        return [self._whole(each) for each in self._waiting()]
+
+    def _look_up(self) -> None:
+        if time.monotonic() - self.looked_s < _STUCK_S:
+            self._beat()
+        if self.stop.is_set():
+            raise Stopped
+
+    def _whole(self, item: Chunk | Exception) -> Chunk:
+        if isinstance(item, Exception):
+            self._unheard.put(item)  # for who asks again
+            raise self._lost(item) from item
+        return item
+
+    def _waiting(self) -> list[Chunk | Exception]:
+        """Take all that nobody has heard."""
+        return [self._unheard.get() for _ in range(self._unheard.qsize())]
+
+    def _take(self) -> None:
+        """Read, stamp and record until the port is closed or lost."""
+        empty = False
+        try:
+            while True:
+                ready, _, _ = select.select([self._fd, self._closing], [], [], _WAIT_S)
+                if self._closing in ready:
+                    return
+                with self._taking:
+                    data = b""
+                    if ready:
+                        with contextlib.suppress(BlockingIOError):
+                            data = os.read(self._fd, _READ_BYTES)
+                    t_ns = time.monotonic_ns()
+                    if data:
+                        self._tap("rx", t_ns, data)
+                        if self._unheard.qsize() < _UNHEARD:
+                            self._unheard.put(Chunk(t_ns, data))
+                    elif ready and empty:  # readable again, and again nothing there: hung up
+                        raise OSError(errno.EIO, os.strerror(errno.EIO))
+                empty = bool(ready) and not data  # once, somebody else may have read it
+                self.looked_s = t_ns * 1e-9
+        except (OSError, ValueError, termios.error) as error:
+            self._unheard.put(error)
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises DeviceLost."""
@@ -162,7 +209,13 @@ class Port:
                 raise self._lost(error) from error
 
     def close(self) -> None:
-        """Give the line back."""
+        """Give the line back; what was read and not heard stays where it was recorded."""
+        if self._closed:
+            return
+        self._closed = True
+        os.eventfd_write(self._closing, 1)
+        self._reader.join()
+        os.close(self._closing)
         with contextlib.suppress(OSError, termios.error):
             self._serial.close()
 

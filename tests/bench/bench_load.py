@@ -28,7 +28,6 @@ from polecal.daemon.config import SPAN
 from polecal.daemon.control import Client, NoDaemon, Refused
 from polecal.daemon.recorder import Record
 from polecal.daemon.sessions import CAPTURE
-from polecal.daemon.urgent import urgently
 from polecal.drivers.emulated import laser_telegrams as lms
 from polecal.drivers.emulated.drive import ThereAndBack
 from polecal.drivers.emulated.laser import EmulatedLaser
@@ -36,6 +35,7 @@ from polecal.drivers.emulated.receiver import EmulatedReceiver
 from polecal.drivers.emulated.serve import serve
 from polecal.drivers.emulated.virtual import STREAM_LOGS, play
 from polecal.drivers.emulated.world import HAND_MEASURED, demo_world
+from polecal.drivers.urgent import urgently
 from tests.bench.hearing import HEAD, peak_mb, rss_mb
 
 HEADINGS = ("lasers", "what", "value", "unit", "target")

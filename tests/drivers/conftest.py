@@ -99,6 +99,17 @@ class VirtualPort:
             wake_ns = end_ns if moment is None else max(moment, self._clock.ns + round(READ_S * 1e9))
             self._clock.to(min(wake_ns, end_ns))
 
+    @property
+    def looked_s(self) -> float:
+        return self._clock.ns * 1e-9
+
+    def gather(self, seconds: float) -> list[Chunk]:
+        chunks, end_ns = [], self._clock.ns + round(seconds * 1e9)
+        while self._clock.ns < end_ns:
+            chunk = self.read((end_ns - self._clock.ns) * 1e-9)
+            chunks += [] if chunk is None else [chunk]
+        return chunks
+
     def write(self, data: bytes) -> None:
         self._tap("tx", self._clock.ns, data)
         self._peer.receive(self._clock.ns, data, self.baud)

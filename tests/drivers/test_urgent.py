@@ -5,11 +5,11 @@ import threading
 
 import pytest
 
-from polecal.daemon.urgent import urgently
+from polecal.drivers.urgent import urgently
 
 WITHOUT_RIGHTS = """
 import os, resource
-from polecal.daemon.urgent import urgently
+from polecal.drivers.urgent import urgently
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 if os.getuid() == 0:
     os.setgroups([])
