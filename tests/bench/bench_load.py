@@ -89,7 +89,7 @@ def emulate(folder: str, name: str, start_ns: int) -> None:
     stop = threading.Event()
     serving = {f"{folder}/{name}": _Noted(device, log)}
     # a real one does not wait for this machine's processors
-    thread = threading.Thread(target=urgently, args=(serve, serving), kwargs={"stop": stop})
+    thread = threading.Thread(target=serve, args=(serving,), kwargs={"stop": stop})
     thread.start()
     sys.stdin.read()
     stop.set()
