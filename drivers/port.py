@@ -37,7 +37,7 @@ Tap = Callable[[Direction, int, bytes], None]
 """Takes (direction, CLOCK_MONOTONIC ns, bytes) of every chunk; of those that were read, in their order."""
 
 _READ_BYTES = 4096  # more than one read ever finds: 17 kB a pty's whole buffer, 4 kB a tty's
-_WAIT_S = 0.2  # how long a read goes without looking whether it should stop
+_WAIT_S, _WAIT_MS = 0.2, 200  # how long a read goes without looking whether it should stop
 _WRITE_S = 2.0  # a line that takes no bytes for so long is lost
 _UNHEARD = 50_000  # chunks, minutes of them; those beyond it are recorded, and heard by nobody
 _STUCK_S = 5 * _WAIT_S
@@ -170,12 +170,13 @@ class Port:
 
     def _take(self) -> None:
         """Read, stamp and record until the port is closed or lost."""
+        waiting = select.poll()
+        for fd in (self._fd, self._closing):
+            waiting.register(fd, select.POLLIN)
         empty = False
         try:
-            while True:
-                ready, _, _ = select.select([self._fd, self._closing], [], [], _WAIT_S)
-                if self._closing in ready:
-                    return
+            while not self._closed:
+                ready = waiting.poll(_WAIT_MS)
                 with self._taking:
                     data = b""
                     if ready:
@@ -186,7 +187,7 @@ class Port:
                         self._tap("rx", t_ns, data)
                         if self._unheard.qsize() < _UNHEARD:
                             self._unheard.put(Chunk(t_ns, data))
-                    elif ready and empty:  # readable again, and again nothing there: hung up
+                    elif ready and empty and not self._closed:  # readable, and again nothing there: hung up
                         raise OSError(errno.EIO, os.strerror(errno.EIO))
                 empty = bool(ready) and not data  # once, somebody else may have read it
                 self.looked_s = t_ns * 1e-9

@@ -35,7 +35,6 @@ from polecal.drivers.emulated.receiver import EmulatedReceiver
 from polecal.drivers.emulated.serve import serve
 from polecal.drivers.emulated.virtual import STREAM_LOGS, play
 from polecal.drivers.emulated.world import HAND_MEASURED, demo_world
-from polecal.drivers.urgent import urgently
 from tests.bench.hearing import HEAD, peak_mb, rss_mb
 
 HEADINGS = ("lasers", "what", "value", "unit", "target")
