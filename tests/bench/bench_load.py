@@ -87,7 +87,7 @@ def emulate(folder: str, name: str, start_ns: int) -> None:
     )
     stop = threading.Event()
     serving = {f"{folder}/{name}": _Noted(device, log)}
-    # a real one does not wait for this machine's processors
+    # at no priority: it would hold up the kernel's own work on a line, as no real device does
     thread = threading.Thread(target=serve, args=(serving,), kwargs={"stop": stop})
     thread.start()
     sys.stdin.read()
