@@ -33,11 +33,11 @@ def balance(near: Subsets, without: NDArray[np.bool_], known: Array, most: float
     pole, ground = near.sides(without)
     beforehand = np.diag(known[near.free])
     tried = most ** np.linspace(0.0, 1.0, _TRIED)
-    gradient, information = (
-        of_pole + tried.reshape(-1, *[1] * of.ndim) * of for of_pole, of in zip(pole, ground, strict=True)
-    )
+    gradient, information = (np.multiply.outer(tried, of) for of in ground)
+    gradient += pole[0]
+    information += pole[1] + beforehand
     steps = np.zeros((_TRIED, len(without), len(UNKNOWNS)))
-    steps[..., near.free] = -np.linalg.solve(information + beforehand, gradient[..., None])[..., 0]
+    steps[..., near.free] = -np.linalg.solve(information, gradient[..., None])[..., 0]
     scatter = np.diagonal(jackknife(steps), axis1=1, axis2=2)[:, : len(PARAMETERS)]
     logs = np.log(np.maximum(scatter, _NOTHING)).sum(axis=1)
     return float(tried[np.flatnonzero(logs <= logs.min() + _NEARLY)[-1]])

@@ -43,7 +43,7 @@ _NAME_ONE = "name a capture.mcap of polecal"
 Direction = Literal["rx", "tx"]
 _Line = tuple[str, Direction]
 _EVENT_LINE: _Line = ("", "rx")  # stands for that of the events, which are no device's
-_R = TypeVar("_R", Channel, Chunk)
+_R = TypeVar("_R", Channel, Chunk, DataEnd)
 
 
 class RecorderError(PolecalError):
@@ -330,7 +330,7 @@ class Capture:
         if not magic or magic != _MAGIC[: len(magic)]:
             raise RecorderError(f"{self.path}: not a capture, no MCAP file at all", _NAME_ONE)
         self.used_bytes, crc = len(magic), zlib.crc32(magic)
-        held, lacking = b"", 0
+        held, lacking, ended = b"", 0, False
         while more := stream.read(max(_AT_ONCE_BYTES, lacking)):
             held, at, lacking = held + more, 0, 0
             while (start := at + _RECORD_HEAD.size) <= len(held):
@@ -343,8 +343,9 @@ class Capture:
                 if end > len(held):
                     lacking = end - len(held)
                     break
-                if opcode == _DATA_END and length >= 4:
-                    told = DataEnd.read(ReadDataStream(BytesIO(held[start:end]))).data_section_crc
+                if opcode == _DATA_END:
+                    ended = True
+                    told = _read(DataEnd, held[start:end]).data_section_crc
                     if told not in (0, zlib.crc32(memoryview(held)[:at], crc)):
                         raise _Cut("is damaged (bytes in it were changed: the CRC is wrong)")
                 yield opcode, held[start:end]
@@ -352,6 +353,8 @@ class Capture:
                     yield from _inside(held[start:end])
                 self.used_bytes += end - at
                 if opcode == _FOOTER:
+                    if not ended:
+                        raise _Cut("is damaged (its data have no end)")
                     if held[end:] + stream.read() != _MAGIC:
                         raise _Cut(_CUT_OFF)
                     self.used_bytes = self.size_bytes

@@ -215,6 +215,24 @@ def test_a_changed_byte_is_told(closed):
     assert "CRC is wrong" in capture.cut
 
 
+def test_data_without_their_end_and_its_crc_are_told(closed):
+    whole = closed.read_bytes()
+    at = whole.index(b"\x0f" + (4).to_bytes(8, "little"))  # DataEnd
+    closed.write_bytes(whole[:at] + b"\x7f" + whole[at + 1 :])
+    capture = recorder.read(closed)
+    assert list(capture) == ITEMS
+    assert "is damaged" in capture.cut
+
+
+def test_a_record_longer_than_what_is_read_at_once_is_read(path):
+    long = Record("front", "rx", 5, bytes(range(256)) * 4000)
+    with Recorder(path, METADATA) as writing:
+        put(writing, [*ITEMS, long, *ITEMS])
+    capture = recorder.read(path)
+    assert list(capture) == [*ITEMS, long, *ITEMS]
+    assert capture.cut is None
+
+
 def test_blocks_of_zeros_at_the_end_are_not_taken_for_data(path):
     writing = Recorder(path, METADATA)
     put(writing, ITEMS)
