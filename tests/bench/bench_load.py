@@ -281,7 +281,7 @@ def _soak() -> Iterator[tuple[str, float, str, str]]:
     for at in held:
         when = f"{at['t_s'] / 60:.0f} minutes, {at['passes']} passes"
         yield f"soak: memory after {when}", at["rss_mb"], "MB", ""
-        yield f"soak: memory's peak in the last of {when}", at["peak_mb"], "MB", "≤ 100"
+        yield f"soak: peak until {when}", at["peak_mb"], "MB", "≤ 100"
     first, last = held[0], held[-1]
     grown_mb = last["rss_mb"] - first["rss_mb"]
     yield f"soak: grown since minute {first['t_s'] / 60:.0f}", grown_mb, "MB", "≤ 10"
