@@ -81,21 +81,41 @@ def test_what_the_disk_does_not_give_back_is_told_and_where_it_comes_from_again(
     assert "replay" in error.value.hint
 
 
-def test_a_run_whose_sums_are_on_the_disk_gives_the_same_to_the_last_bit(
-    drive, begun, settings, tmp_path, monkeypatch
-):
-    chunks = drive.until(100.0)
-    here = begun(settings()).feed(chunks).pipeline
-    monkeypatch.setattr(pipelines, "Spill", lambda _: Spill(tmp_path, in_memory_bytes=0))
-    there = begun(settings()).feed(chunks).pipeline
-    assert len(there.passes()) > 3
-    sums = [
-        of for laser in there._lasers.values() for one in laser.passes for of in one.moments.totals.values()
+def sums_of(pipeline):
+    return [
+        of
+        for laser in pipeline._lasers.values()
+        for one in laser.passes
+        for of in one.moments.totals.values()
     ]
-    assert all(callable(of.held) for of in sums)
-    for pipeline in (here, there):
-        choice = pipeline.choice("2", drop=True, by="ann", at="2026-11-22T03:17:00+00:00")
-        pipeline.choose(10**13, choice)
+
+
+@pytest.fixture
+def driven(drive, begun, settings, monkeypatch):
+    """Drives for 100 s with sums kept in a folder, drops a pass and ends; gives the pipeline."""
+
+    def run(folder):
+        with monkeypatch.context() as patched:
+            patched.setattr(pipelines, "Spill", lambda _: Spill(folder, in_memory_bytes=0))
+            pipeline = begun(settings()).feed(drive.until(100.0)).pipeline
+        pipeline.choose(10**13, pipeline.choice("2", drop=True, by="ann", at="2026-11-22T03:17:00+00:00"))
         pipeline.finish(10**13, "asked to stop")
+        return pipeline
+
+    return run
+
+
+def test_a_run_whose_sums_are_on_the_disk_gives_the_same_to_the_last_bit(driven, tmp_path):
+    here, there = driven(None), driven(tmp_path)
+    assert len(there.passes()) > 3
+    assert all(callable(of.held) for of in sums_of(there))
     assert here.calibration() == there.calibration()
     assert here.passes() == there.passes()
+
+
+def test_a_run_whose_disk_fills_on_the_way_keeps_all_its_passes(driven, small_disk):
+    here, there = driven(None), driven(small_disk("200k"))
+    assert {callable(of.held) for of in sums_of(there)} == {True, False}
+    assert here.calibration() == there.calibration()
+    del there
+    gc.collect()  # the disk is to be taken away
