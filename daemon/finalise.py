@@ -34,7 +34,7 @@ from mcap.writer import CompressionType, Writer
 
 from polecal import PolecalError, __version__
 from polecal.daemon import recorder, reporting
-from polecal.daemon.recorder import METADATA, RecorderError
+from polecal.daemon.recorder import FULL, METADATA, RecorderError
 from polecal.daemon.sessions import CAPTURES, captures_of
 
 REPAIR = "polecal.repair"
@@ -43,6 +43,7 @@ REPAIR = "polecal.repair"
 _PART, _DAMAGED = ".part", ".damaged"
 _DECODED = "decoded"
 _LOOK_EVERY = 500  # messages: a few seconds of a capture
+_NO_ROOM = "too little room on the disk: what was recorded is whole; make room before the next run ends"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +119,7 @@ def _replace(capture: recorder.Capture, leave_bytes: int, *, decoded: bool) -> F
             try:
                 messages, more = _write(capture, part, leave_bytes)
             except (OSError, RecorderError, _NotDecoded) as error:
-                why = error.strerror or str(error) if isinstance(error, OSError) else str(error)
+                why = _words(error)
         if why is not None:
             messages, more = _write(capture, part, None)
         if capture.damaged:
@@ -190,24 +191,37 @@ def _decoding(
 
     def decode(item: recorder.Record | recorder.Event | None) -> int:
         if next(taken) % _LOOK_EVERY == 0 and shutil.disk_usage(folder).free < leave_bytes:
-            raise _NotDecoded("too little room on the disk")
+            raise _NotDecoded(_NO_ROOM)
         try:
             if item is None:
                 decoder.finish()
             else:
                 decoder.take(item)
         except Exception as error:
-            raise _NotDecoded(f"{error!r}") from error
+            raise _NotDecoded(_words(error)) from error
         return decoder.count
 
     try:
         decoder = Decoder(capture.metadata, folder, writer)
     except Exception as error:
-        raise _NotDecoded(str(error)) from error
+        raise _NotDecoded(_words(error)) from error
     try:
         yield decode
     finally:
         decoder.close()
+
+
+def _words(error: Exception) -> str:
+    """Say what kept a capture from being decoded, and what to do."""
+    if isinstance(error, PolecalError):
+        return f"{error}: {error.hint}" if error.hint else str(error)
+    if isinstance(error, OSError) and error.errno in FULL:
+        return _NO_ROOM
+    if isinstance(error, OSError):
+        return (
+            f"{error.strerror or error}: what was recorded is whole; see that the disk is there and has room"
+        )
+    return str(error) if isinstance(error, _NotDecoded) else f"a bug in polecal: {error!r}; report it"
 
 
 def _digest(capture: recorder.Capture) -> bytes:

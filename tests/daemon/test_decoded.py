@@ -1,5 +1,6 @@
 """A finalised capture has what its chunks mean, as the official reader and decoders find it."""
 
+import errno
 import json
 import os
 import shutil
@@ -407,6 +408,22 @@ def test_a_bug_in_decoding_costs_nothing_that_was_recorded(finalised, tmp_path, 
     assert os.listdir(tmp_path) == ["capture.mcap"]
 
 
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), OSError(errno.EIO, "I/O error")])
+def test_a_disk_that_fails_while_the_last_clouds_are_written_is_told_with_what_to_do(
+    finalised, tmp_path, monkeypatch, error
+):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(Decoder, "finish", fail)
+    done = Heard(finalised.path, 0.02)
+    path = done.into(tmp_path)
+    assert list(recorder.read(path)) == done.items
+    assert "what was recorded is whole" in done.done.not_decoded
+    assert "room" in done.done.not_decoded
+    assert "Error(" not in done.done.not_decoded
+
+
 def test_where_the_disk_has_room_only_for_what_was_recorded_the_rest_is_left_out(
     recorded, small_disk, tmp_path
 ):
@@ -414,7 +431,7 @@ def test_where_the_disk_has_room_only_for_what_was_recorded_the_rest_is_left_out
     folder = small_disk("13m")
     path = copied(recorded, folder / "session")
     done = finalise(path, 2_000_000)
-    assert done.not_decoded == "too little room on the disk"
+    assert done.not_decoded.startswith("too little room on the disk: what was recorded is whole; make room")
     assert list(recorder.read(path)) == list(recorder.read(recorded.session.capture))
     assert os.listdir(path.parent) == ["capture.mcap"]
 
@@ -423,7 +440,7 @@ def test_where_the_disk_is_full_in_the_midst_of_it_the_rest_is_left_out(recorded
     monkeypatch.setattr(finalising, "_LOOK_EVERY", 10**9)  # as if another had filled it since
     path = copied(recorded, small_disk("12m") / "session")
     done = finalise(path)
-    assert "No space left" in done.not_decoded
+    assert done.not_decoded.startswith("too little room on the disk: what was recorded is whole; make room")
     assert done.messages == sum(1 for _ in recorder.read(recorded.session.capture))
 
 
