@@ -44,6 +44,7 @@ OnPass = Callable[[str, StoredPass], None]
 OnScan = Callable[[str, int, Decoded], None]
 """Takes (laser's name, host time at which its telegram began, scan) of every scan of the right variant."""
 
+GO_ON = "it was not calibrated: go on with it by `polecal-field start --continue`"
 _COLLECTING = State.COLLECTING  # asked for with each chunk: an enum takes four times as long to find it in
 _COSTS = 40  # after the last so many passes, for who looks on
 _ABSURD_SIGMAS = 20.0  # off the hand measurement: of the default 0.1 m and 5 degrees, 2 m and 100 degrees
@@ -430,7 +431,7 @@ class Pipeline:
         if not self.routine.running and self.routine.state not in (State.ACCEPTED, State.REJECTED):
             raise Refused(
                 f"nothing can be dropped or kept while the session is {self.routine.state}",
-                "it was not calibrated: go on with it by `polecal-field start --continue`",
+                GO_ON,
                 Code.USAGE,
             )
 

@@ -16,10 +16,10 @@ import structlog
 from polecal import PolecalError
 from polecal.daemon.choices import Choice
 from polecal.daemon.config import SPAN, Config
-from polecal.daemon.control import Refused
+from polecal.daemon.control import Code, Refused
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.past import Past
-from polecal.daemon.pipeline import Pipeline
+from polecal.daemon.pipeline import GO_ON, Pipeline
 from polecal.daemon.recorder import FULL, DiskFull, Event, Record, Recorder, RecorderError
 from polecal.daemon.replay import BEGIN, CHOICE, FINISH, play
 from polecal.daemon.route import Stand
@@ -106,6 +106,8 @@ class Run:
         self._unwritten: list[tuple[str, Callable[[], object]]] = []  # what there was no room for
         self._write_again_s = 0.0
         self._known = self._know()
+        self._asking = threading.Lock()  # the order in which inputs are put
+        self._given_up = False
         self._asked: dict[int, Future[dict[str, Any] | None]] = {}  # by the event that asks
         self._threads: list[threading.Thread] = []
         self._engine = threading.Thread(target=self._work, name="engine")
@@ -161,7 +163,10 @@ class Run:
         """End the run, also as a fault or with what there is calibrated; returns once all is closed."""
         if not self.ended.is_set():
             finish = Event(time.monotonic_ns(), {"event": FINISH, "why": why})
-            self._writer.put(finish if calibrate and problem is None else _End(why, problem))
+            with self._asking:
+                calibrated = calibrate and problem is None
+                self._given_up = self._given_up or not calibrated
+                self._writer.put(finish if calibrated else _End(why, problem))
         self.ended.wait()
 
     def passes(self) -> list[dict[str, Any]]:
@@ -202,9 +207,12 @@ class Run:
         """Have the engine drop or keep a pass, which is an input as any; None if the run ended before it."""
         if self._writer.full is not None:
             raise DiskFull(f"nothing is recorded: {self._writer.full}", MAKE_ROOM)
-        event = Event(time.monotonic_ns(), {"event": CHOICE, "choice": choice.as_dict()})
-        answer = self._asked[id(event)] = Future()
-        self._writer.put(event)
+        with self._asking:
+            if self._given_up:  # behind that a choice would be refused, but be in the capture
+                raise Refused("the session is being stopped, and not calibrated", GO_ON, Code.USAGE)
+            event = Event(time.monotonic_ns(), {"event": CHOICE, "choice": choice.as_dict()})
+            answer = self._asked[id(event)] = Future()
+            self._writer.put(event)
         while not self.ended.is_set():
             with contextlib.suppress(TimeoutError):
                 return answer.result(_LOOK_S)

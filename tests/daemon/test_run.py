@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 from polecal.daemon import recorder, sessions
+from polecal.daemon.choices import Choice
 from polecal.daemon.config import Storage
+from polecal.daemon.control import Refused
 from polecal.daemon.recorder import RecorderError
 from polecal.daemon.replay import BEGIN, FINISH, replay
 from polecal.daemon.routine import State
@@ -100,6 +102,29 @@ def test_the_capture_holds_every_byte_both_ways_in_order_and_what_was_done(ended
         "rejected",
     ]
     assert {"event": FINISH, "why": "asked to stop"} in events
+
+
+def test_a_drop_behind_a_stop_is_refused_and_not_in_the_capture(bench, begin, monkeypatch):
+    """A replay would apply it."""
+    run = begin(bench)
+    ending, go_on, end = threading.Event(), threading.Event(), run._end
+
+    def late(item):
+        ending.set()
+        go_on.wait(20.0)
+        end(item)
+
+    monkeypatch.setattr(run, "_end", late)
+    stopping = threading.Thread(target=run.stop, args=("asked to stop",))
+    stopping.start()
+    assert ending.wait(20.0)
+    choice = Choice("front", 1, drop=True, by="me", at="now", site=0, t_ns=(0, 1))
+    with pytest.raises(Refused, match="is being stopped"):
+        run._choose_running(choice)
+    go_on.set()
+    stopping.join()
+    events = [item.content for item in recorder.read(run.session.capture) if hasattr(item, "content")]
+    assert "choice" not in {event["event"] for event in events}
 
 
 def test_devices_are_left_polite(ended):
