@@ -95,7 +95,7 @@ class Scatter:
             sums[..., self._moved] += self._shift_m * sums[..., self._along]
         return sums
 
-    def _rows(self, kept: Array) -> Array:
+    def _as_summed(self, kept: Array) -> Array:
         """Give rows (K, …) for features as they were summed up that do what ``kept`` do for those here."""
         rows = np.zeros((len(self._passes[0].features), *kept.shape[1:]))
         rows[self._kept] = kept
@@ -164,7 +164,7 @@ class Scatter:
         """Give these sums along rows (A, 108, M) of A axes: all that is to be known of their mixtures."""
         there = np.ascontiguousarray(basis[:, self._features].swapaxes(0, 1))  # (K, A, M)
         mean = np.tensordot(self._mean, there, 1)
-        within = self._squares(self._rows(there))
+        within = self._each_along(self._as_summed(there))
         within -= (self.count[:, None, None] * mean.swapaxes(1, 2)) @ mean
         taken = within
         if self._aside is not None and np.isfinite(ratio):
@@ -180,7 +180,7 @@ class Scatter:
             (self._mean * np.tile(_RAY, 3)[self._features]) @ there[:, 0],
         )
 
-    def _squares(self, rows: Array) -> Array:
+    def _each_along(self, rows: Array) -> Array:
         """Give Σ over axes of rowsᵀ Σ f fᵀ rows of each pass, (P, M, M), of (K, A, M); few at a time."""
         width, squares = len(rows), []
         second = np.empty((min(_AT_ONCE, len(self._passes)), width, width))
@@ -206,7 +206,7 @@ class Scatter:
 
     def within(self, rows: Array) -> Array:
         """Give each pass's variance within, (P,), m², the mean over the given rows (k, 108)."""
-        there = self._rows(rows[:, self._features].T)
+        there = self._as_summed(rows[:, self._features].T)
         square = (2.0 * (there @ there.T)).ravel()
         square[:: len(there) + 1] /= 2.0
         packed = square[upper(len(there))]
