@@ -34,6 +34,8 @@ class Subsets:
     weights: Weights
     vector: Array
     free: NDArray[np.bool_]
+    bases: tuple[Array, Array]
+    """(A, 108, M) of pole and ground: what they are looked along."""
 
     @classmethod
     def near(
@@ -46,21 +48,17 @@ class Subsets:
     ) -> Subsets:
         """Look at passes from a vector."""
         rows = np.concatenate([[True], free])
-        return cls(
-            pole.along(pole_basis(vector)[:, :, rows], weights.pole_ratio),
-            ground.along(ground_basis(vector)[:, :, rows], weights.ground_ratio),
-            weights,
-            vector,
-            free,
-        )
+        bases = pole_basis(vector)[:, :, rows], ground_basis(vector)[:, :, rows]
+        alongs = _along((pole, ground), bases, weights)
+        return cls(*alongs, weights, vector, free, bases)
 
     def __len__(self) -> int:
         return len(self.pole.count)
 
     def with_more(self, pole: Scatter, ground: Scatter) -> Subsets:
         """Give these and more passes."""
-        more = Subsets.near(pole, ground, self.weights, self.vector, self.free)
-        return replace(self, pole=self.pole.joined(more.pole), ground=self.ground.joined(more.ground))
+        of_pole, of_ground = _along((pole, ground), self.bases, self.weights)
+        return replace(self, pole=self.pole.joined(of_pole), ground=self.ground.joined(of_ground))
 
     def minima(self, subsets: NDArray[np.bool_], bend: Array) -> Array:
         """Give the minimum (B, 12) of each of B subsets (B, P); ``bend`` (12, 12) is `solve.Form.bend`."""
@@ -138,6 +136,14 @@ class Subsets:
             squares = np.einsum("pi,pij,pj->p", rows, along.within, rows) + along.count * (off**2).sum(axis=1)
             total += float(squares[used].sum()) / max(1.0, float(along.count[used].sum()))
         return float(np.sqrt(max(0.0, total)))  # of passes of one return each rounding is all there is
+
+
+def _along(
+    scatters: tuple[Scatter, Scatter], bases: tuple[Array, Array], weights: Weights
+) -> tuple[Along, Along]:
+    """Look at pole and ground along their bases, weighed."""
+    (pole, ground), (of_pole, of_ground) = scatters, bases
+    return pole.along(of_pole, weights.pole_ratio), ground.along(of_ground, weights.ground_ratio)
 
 
 class _Cost:
