@@ -1,7 +1,8 @@
 """An estimate, and scans of the pass that is being driven, to the estimate with those scans.
 
 The passes that are closed are, near the estimate, a few small matrices each (`subsets`); a scan adds its own
-sums, and all of it is solved again: it costs the same after a hundred returns and after a hundred million.
+sums, and all of it is solved again: it costs the same after a hundred returns and after a hundred million,
+after ten passes and after hundreds.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class Running:
         pole, ground = scatters_of(used, self._radius_m)
         self._bend = Form.of(pole, ground, np.ones(len(used), dtype=bool), result.weights).bend(result.vector)
         self._closed = Subsets.near(pole, ground, result.weights, result.vector, self._free)
-        self._all, self._untold = self._closed, np.zeros((6, 6))
+        self._together, self._paper = self._closed.merged(), self._closed.paper().merged()
+        self._driven: Subsets | None = None
+        self._untold = np.zeros((6, 6))
         if result.left_out:
             left_out = self._closed.minima(~np.eye(len(used), dtype=bool), self._bend)
             self._untold = result.covariance - jackknife(left_out)[:6, :6]
@@ -64,18 +67,19 @@ class Running:
             )
             self._open[kind] = sum(blocks.values(), before)
         open_pass = Pass(0, self._open, {}, self._site)
-        self._all = self._closed.with_more(*scatters_of([open_pass], self._radius_m))
-        (minimum,) = self._all.minima(np.ones((1, len(self._all)), dtype=bool), self._bend)
-        return Now(Mount.from_vector(minimum[:6]), self._all.cost_m(minimum))
+        driven = self._driven = self._closed.others(*scatters_of([open_pass], self._radius_m))
+        together = self._together.joined(driven)
+        (minimum,) = together.minima(np.ones((1, len(together)), dtype=bool), self._bend)
+        cost_m = self._paper.joined(driven.paper()).spread_m(minimum)
+        return Now(Mount.from_vector(minimum[:6]), cost_m)
 
     @one_thread
     def sigma(self) -> Mount:
         """Give σ of what is free, from the scatter of all passes with the open one; of the rest as it was."""
         if not self._result.left_out:
             return self._result.sigma
-        told = (
-            self._untold
-            + jackknife(self._all.minima(~np.eye(len(self._all), dtype=bool), self._bend))[:6, :6]
-        )
+        every = self._closed if self._driven is None else self._closed.joined(self._driven)
+        scatter = jackknife(every.minima(~np.eye(len(every), dtype=bool), self._bend))
+        told = self._untold + scatter[:6, :6]
         variance = np.where(self._free[:6], np.diag(told), np.diag(self._result.covariance))
         return Mount.of_variance(np.maximum(0.0, variance))

@@ -9,7 +9,7 @@ ground adds to Eq. 6, the more the beams graze it, can be taken off.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,9 +264,39 @@ class Along:
 
     def joined(self, more: Along) -> Along:
         """Give these passes and more."""
-        return Along(
-            *(np.concatenate([getattr(of, part.name) for of in (self, more)]) for part in fields(self))
-        )
+        return _joined([self, more])
+
+    def paper(self) -> Along:
+        """Give these passes as they count in Eq. 7."""
+        return replace(self, weight=self.count, taken=self.within)
+
+    def merged(self) -> Along:
+        """Give those of each site as one: they are the same in a form of all, and no more is known of any.
+
+        By how much their means are apart, as they weigh, is in what the form takes.
+        """
+        merged = []
+        for of in _each(self.sites):
+            count, weight, mean = self.count[of], self.weight[of], self.mean[of]
+            middle = np.tensordot(weight, mean, 1) / (weight.sum() or 1.0)
+            apart = np.sqrt(weight)[:, None, None] * (mean - middle)
+            taken = self.taken[of].sum(axis=0) + np.tensordot(apart, apart, ([0, 1], [0, 1]))
+            ray = count @ self.ray[of] / (count.sum() or 1.0)
+            sums = (
+                count.sum(),
+                weight.sum(),
+                self.sites[of][0],
+                middle,
+                self.within[of].sum(axis=0),
+                taken,
+                ray,
+            )
+            merged.append(Along(*(np.array([one]) for one in sums)))
+        return _joined(merged)
+
+
+def _joined(parts: Sequence[Along]) -> Along:
+    return Along(*(np.concatenate([getattr(of, part.name) for of in parts]) for part in fields(Along)))
 
 
 def _squares(matrices: Array, rows: Array, others: Array) -> Array:

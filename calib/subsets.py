@@ -55,10 +55,24 @@ class Subsets:
     def __len__(self) -> int:
         return len(self.pole.count)
 
-    def with_more(self, pole: Scatter, ground: Scatter) -> Subsets:
-        """Give these and more passes."""
-        of_pole, of_ground = _along((pole, ground), self.bases, self.weights)
-        return replace(self, pole=self.pole.joined(of_pole), ground=self.ground.joined(of_ground))
+    def others(self, pole: Scatter, ground: Scatter) -> Subsets:
+        """Look at other passes alike."""
+        return self._with(*_along((pole, ground), self.bases, self.weights))
+
+    def joined(self, more: Subsets) -> Subsets:
+        """Give these passes and `others`."""
+        return self._with(self.pole.joined(more.pole), self.ground.joined(more.ground))
+
+    def paper(self) -> Subsets:
+        """Give these passes as they count in Eq. 7."""
+        return self._with(self.pole.paper(), self.ground.paper())
+
+    def merged(self) -> Subsets:
+        """Give those of each site as one, of which there are no subsets but all: the same, and sooner."""
+        return self._with(self.pole.merged(), self.ground.merged())
+
+    def _with(self, pole: Along, ground: Along) -> Subsets:
+        return replace(self, pole=pole, ground=ground)
 
     def minima(self, subsets: NDArray[np.bool_], bend: Array) -> Array:
         """Give the minimum (B, 12) of each of B subsets (B, P); ``bend`` (12, 12) is `solve.Form.bend`."""
@@ -66,17 +80,17 @@ class Subsets:
         found[:, self.free] += self._steps(subsets.astype(np.float64), bend[np.ix_(self.free, self.free)])
         return found
 
-    def cost_m(self, vector: Array) -> float:
-        """Give √c of Eq. 7 of all passes in m, at a vector (12,) that is near."""
+    def spread_m(self, vector: Array) -> float:
+        """Give √ of what all passes spread, in m at a vector (12,) that is near: of `paper` √c of Eq. 7."""
         row, total = np.concatenate([[1.0], (vector - self.vector)[self.free]]), 0.0
         for along in (self.pole, self.ground):
             off = along.mean @ row
             for site in np.unique(along.sites):
                 of = along.sites == site
-                off[of] -= along.count[of] / max(1.0, along.count[of].sum()) @ off[of]
-            squares = (along.within @ row @ row).sum() + along.count @ (off**2).sum(axis=1)
+                off[of] -= along.weight[of] / (along.weight[of].sum() or 1.0) @ off[of]
+            squares = row @ along.taken.sum(axis=0) @ row + along.weight @ (off**2).sum(axis=1)
             total += float(squares) / max(1.0, float(along.count.sum()))
-        return float(np.sqrt(max(0.0, total)))
+        return float(np.sqrt(max(0.0, total)))  # of passes of one return each rounding is all there is
 
     def sides(self, subsets: NDArray[np.bool_]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Give what pole and ground, each by itself, say of B subsets at the vector.

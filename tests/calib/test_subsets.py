@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -62,7 +64,7 @@ def test_the_minimum_of_all_stays_where_it_is(problem):
     (found,) = near.minima(np.ones((1, P), dtype=bool), form.bend(vector))
     assert found == pytest.approx(vector, abs=1e-8)
     eq7 = Form.of(pole, ground, np.ones(P, dtype=bool))
-    assert near.cost_m(found) == pytest.approx(solve.cost_m(eq7, vector), rel=1e-8)
+    assert near.paper().spread_m(found) == pytest.approx(solve.cost_m(eq7, vector), rel=1e-8)
 
 
 def test_how_rows_bend_makes_half_the_hessian_whole(problem):
@@ -89,8 +91,25 @@ def test_a_pass_that_comes_later_counts_as_if_it_had_been_there(problem, passes)
     early, late = (scatters_of(some, 0.04) for some in (passes[:-1], passes[-1:]))
     before = Subsets.near(*early, weights, vector, free)
     subsets = ~np.eye(P + 1, P, -1, dtype=bool)
-    one, other = (of.minima(subsets, form.bend(vector)) for of in (before.with_more(*late), whole))
+    one, other = (
+        of.minima(subsets, form.bend(vector)) for of in (before.joined(before.others(*late)), whole)
+    )
     assert one == pytest.approx(other, abs=1e-8)
+
+
+def test_what_all_passes_say_does_not_change_where_those_of_a_site_are_taken_for_one(problem):
+    pole, ground, weights, vector, _, free, form = problem
+    sites = np.arange(P) // 8
+    near = Subsets.near(pole, ground, weights, vector, free)
+    near = replace(near, pole=replace(near.pole, sites=sites), ground=replace(near.ground, sites=sites))
+    merged = near.merged()
+    assert len(merged) == 2
+    one, other = (of.minima(np.ones((1, len(of)), dtype=bool), form.bend(vector)) for of in (near, merged))
+    assert not np.allclose(one[0, free], vector[free], rtol=0, atol=1e-6)
+    assert other == pytest.approx(one, abs=1e-9)
+    assert merged.spread_m(one[0]) == pytest.approx(near.spread_m(one[0]), rel=1e-9)
+    eq7 = near.paper()
+    assert eq7.merged().spread_m(one[0]) == pytest.approx(eq7.spread_m(one[0]), rel=1e-9)
 
 
 @pytest.mark.parametrize("only", [0, 3])
