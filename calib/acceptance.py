@@ -135,7 +135,7 @@ def given_up(verdict: Verdict, passes: int) -> Verdict:
     """Give the verdict on so many passes that there may be no more: if they are not enough, that is that."""
     if verdict.accepted:
         return verdict
-    why = f"{passes} passes, and still not good enough: more would not help"
+    why = f"{passes} passes, still not good enough: more of the same will not help"
     return Verdict(False, (*verdict.reasons, why), hopeless=True)
 
 

@@ -301,7 +301,7 @@ def test_a_run_ends_with_as_many_passes_as_there_may_be_and_says_so(begun, setti
     assert played.transitions[-2][3] == "front: all 5 passes that there may be"
     assert max(Counter(row["place"] for row in played.pipeline.passes()).values()) == 5
     (reason,) = [one for one in played.laser()["verdict"]["reasons"] if "still not good enough" in one]
-    assert reason.startswith("5 passes, and still not good enough")
+    assert reason.startswith("5 passes, still not good enough")
     assert reason in played.transitions[-1][3]
     assert any("no pass" in one for one in played.laser()["verdict"]["reasons"])
     played.pipeline.choose(played.last_ns, played.pipeline.choice("2", drop=True, by="ann", at="2026-11-22"))
