@@ -47,6 +47,7 @@ OnScan = Callable[[str, int, Decoded], None]
 GO_ON = "it was not calibrated: go on with it by `polecal-field start --continue`"
 _COLLECTING = State.COLLECTING  # asked for with each chunk: an enum takes four times as long to find it in
 _COSTS = 40  # after the last so many passes, for who looks on
+_FEW_LEFT = 10  # passes: from then on it is said that there may be no more
 _ABSURD_SIGMAS = 20.0  # off the hand measurement: of the default 0.1 m and 5 degrees, 2 m and 100 degrees
 
 
@@ -123,7 +124,7 @@ class _LaserRun:
             return  # what was thin from one side has turned out to be a plate, or all were dropped
         with suppress(CalibrationError):
             found = estimate(passes, self.setup, everywhere=everywhere)
-            if self.full:
+            if not self.left:
                 found = replace(found, verdict=given_up(found.verdict, self._most))
             self.alone = self.result = found
             if len(self._config.lasers) > 1:
@@ -135,9 +136,9 @@ class _LaserRun:
                 self.channel.mount = self.result.mount
 
     @property
-    def full(self) -> bool:
-        """Whether there are as many passes as there may be, dropped or not."""
-        return most_of_one(self.passes) >= self._most
+    def left(self) -> int:
+        """How many more passes there may be; those that were dropped count, too."""
+        return max(0, self._most - most_of_one(self.passes))
 
     def passing(self) -> dict[str, Any] | None:
         """Tell of the pass of the pole that is being driven, None where there is none."""
@@ -528,7 +529,7 @@ class Pipeline:
         verdicts = [laser.result.verdict for laser in self._lasers.values() if laser.result is not None]
         if len(verdicts) == len(self._lasers) and all(verdict.accepted for verdict in verdicts):
             self.finish(t_ns, "the criteria are met")
-        elif full := [laser.name for laser in self._lasers.values() if laser.full]:
+        elif full := [laser.name for laser in self._lasers.values() if not laser.left]:
             self.finish(t_ns, f"{' and '.join(full)}: all {self._need.max_passes} passes that there may be")
         elif any(verdict.hopeless for verdict in verdicts):
             self.finish(t_ns, "more of the same driving would not help")
@@ -581,6 +582,8 @@ class Pipeline:
     def _notes(self) -> list[str]:
         notes = self._navigation.why_not + self._navigation.notes if self.routine.running else []
         for laser in self._lasers.values():
+            if self.routine.running and laser.left <= _FEW_LEFT:
+                notes.append(f"{laser.name}: {laser.left} passes more, and the session ends as it is then")
             result = laser.result
             if result is None or not all(part.done for part in result.slices):
                 continue  # most of it will be told by the passes that are still missing

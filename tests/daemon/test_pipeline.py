@@ -308,6 +308,21 @@ def test_a_run_ends_with_as_many_passes_as_there_may_be_and_says_so(begun, setti
     assert reason in played.laser()["verdict"]["reasons"]  # no other is driven in its place
 
 
+def test_it_is_said_beforehand_that_there_may_be_no_more_passes(begun, settings, drive):
+    played, said = begun(settings(routine={"max_passes": 12})), {}
+    for chunk in drive.until(60.0):
+        if played.feed([chunk]).passes and len(played.passes) not in said:
+            notes = [note for note in played.pipeline.status()["notes"] if "passes more" in note]
+            said[len(played.passes)] = (
+                notes,
+                Counter(one.place for _, one in played.passes).most_common(1)[0][1],
+            )
+    assert said[1] == ([], 1)
+    assert len(said) > 3
+    for notes, there in list(said.values())[1:]:
+        assert notes == [f"front: {12 - there} passes more, and the session ends as it is then"] * (there > 1)
+
+
 def test_passes_that_make_a_result_good_count_though_there_may_be_no_more(begun, settings, drive):
     accepted = begun(settings()).feed(drive.chunks)
     assert accepted.state is State.ACCEPTED
