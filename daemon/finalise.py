@@ -29,12 +29,12 @@ from typing import IO, Any, Self
 import structlog
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Channel, Message
+from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 
 from polecal import PolecalError, __version__
-from polecal.daemon import recorder, reporting
-from polecal.daemon.recorder import FULL, METADATA, RecorderError
+from polecal.daemon import recorder, reporting, tail
+from polecal.daemon.recorder import FULL, METADATA, Event, Record, RecorderError
 from polecal.daemon.sessions import CAPTURES, captures_of
 
 REPAIR = "polecal.repair"
@@ -48,10 +48,14 @@ _NO_ROOM = "too little room on the disk: what was recorded is whole; make room b
 
 @dataclass(frozen=True, slots=True)
 class Finalised:
-    """What became of a capture; ``recovered`` says how far it went, None for one that was closed."""
+    """What became of a capture; ``recovered`` says how far it went, None for one that was closed.
+
+    ``from_tail`` of its messages had been read, and not yet been written when the run was killed.
+    """
 
     capture: str
     messages: int
+    from_tail: int
     size_bytes: tuple[int, int]
     """Before and after."""
     recovered: str | None
@@ -91,6 +95,7 @@ def finalise(path: Path, leave_bytes: int = 0, *, decoded: bool = True) -> Final
             if free_bytes - capture.size_bytes < leave_bytes:
                 raise OSError(errno.ENOSPC, "too little room on the disk")
             done = _replace(capture, leave_bytes, decoded=decoded)
+            tail.beside(path).unlink(missing_ok=True)
             os.fsync(folder)
     except OSError as error:
         hint = "see that the disk is there and has room; the next start tries again"
@@ -114,14 +119,15 @@ def _replace(capture: recorder.Capture, leave_bytes: int, *, decoded: bool) -> F
     path = capture.path
     part = path.with_name(f".{path.name}{_PART}")
     why = None if decoded else "it is not asked for"
+    left = tail.read(tail.beside(path))
     try:
         if why is None:
             try:
-                messages, more = _write(capture, part, leave_bytes)
+                written = _write(capture, left, part, leave_bytes)
             except (OSError, RecorderError, _NotDecoded) as error:
                 why = _words(error)
         if why is not None:
-            messages, more = _write(capture, part, None)
+            written = _write(capture, left, part, None)
         if capture.damaged:
             os.link(path, path.with_name(path.name + _DAMAGED))
         size_bytes = part.stat().st_size
@@ -129,55 +135,93 @@ def _replace(capture: recorder.Capture, leave_bytes: int, *, decoded: bool) -> F
     finally:
         with suppress(OSError):
             part.unlink()
-    return Finalised(str(path), messages, (capture.size_bytes, size_bytes), capture.cut, more, why)
+    sizes = (capture.size_bytes, size_bytes)
+    return Finalised(str(path), written.messages, written.from_tail, sizes, capture.cut, written.decoded, why)
 
 
-def _write(capture: recorder.Capture, part: Path, leave_bytes: int | None) -> tuple[int, int]:
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """How many messages a file has: in all but those decoded, of these from the tail, and decoded."""
+
+    messages: int
+    from_tail: int
+    decoded: int
+    digest: bytes
+
+
+def _write(capture: recorder.Capture, left: list[Record], part: Path, leave_bytes: int | None) -> _Written:
     """Write a capture to ``part`` and read it back; decoded, too, unless ``leave_bytes`` is None.
 
-    Gives how many messages were recorded, and how many decoded. Raises OSError, RecorderError, _NotDecoded.
+    What is ``left`` and not in the capture is put behind it. Raises OSError, RecorderError, _NotDecoded.
     """
     with part.open("wb") as file:
-        copied, more, written = _rewrite(capture, file, leave_bytes)
+        written = _rewrite(capture, left, file, leave_bytes)
         file.flush()
         os.fsync(file.fileno())
     after = recorder.read(part)
-    if _digest(after) != written or after.cut is not None:
+    if _digest(after) != written.digest or after.cut is not None:
         raise RecorderError(
             f"{capture.path}: was not read back as it was written", "look at the disk's health"
         )
-    return copied, more
+    return written
 
 
-def _rewrite(capture: recorder.Capture, file: IO[bytes], leave_bytes: int | None) -> tuple[int, int, bytes]:
-    """Copy a capture; give how many messages it has, how many were added, and the digest of the first."""
+def _rewrite(
+    capture: recorder.Capture, left: list[Record], file: IO[bytes], leave_bytes: int | None
+) -> _Written:
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(library=f"polecal {__version__}")
     writer.add_metadata(METADATA, capture.metadata)
-    channels: dict[int, int] = {}
-    digest, copied = hashlib.sha256(), 0
+    channels: dict[tuple[str, str], int] = {}
+    digest, counts = hashlib.sha256(), {False: 0, True: 0}
     with _decoding(capture, writer, leave_bytes) as decode:
-        for channel, body, item in capture.messages():
-            message = recorder.message_of(body)
-            if channel.id not in channels:
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, 0)
+        for of_tail, topic, encoding, message, item in _all(capture, left):
+            if (topic, encoding) not in channels:
+                channels[topic, encoding] = writer.register_channel(topic, encoding, 0)
             writer.add_message(
-                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+                channels[topic, encoding],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
             )
-            digest.update(_identity(channel, message))
-            copied += 1
+            digest.update(_identity(topic, message))
+            counts[of_tail] += 1
             decode(item)
-        more = decode(None)
+        decoded = decode(None)
     if capture.cut is not None:
         writer.add_metadata(REPAIR, {"recovered": capture.cut})
     writer.finish()  # type: ignore[no-untyped-call]
-    return copied, more, digest.digest()
+    return _Written(counts[False], counts[True], decoded, digest.digest())
+
+
+def _all(
+    capture: recorder.Capture, left: list[Record]
+) -> Iterator[tuple[bool, str, str, Message, Record | Event]]:
+    """Give each message: whether it is of the tail, its topic and encoding, itself, and its meaning.
+
+    The chunks of one line are in the order of their times: those of the tail that the capture has are not
+    later than its last.
+    """
+    last_ns: dict[tuple[str, str], int] = {}
+    sequence = 0
+    for channel, body, item in capture.messages():
+        message = recorder.message_of(body)
+        sequence = message.sequence
+        if isinstance(item, Record):
+            last_ns[item.device, item.direction] = item.t_ns
+        yield False, channel.topic, channel.message_encoding, message, item
+    for record in left:
+        if record.t_ns > last_ns.get((record.device, record.direction), -1):
+            sequence += 1
+            message = Message(0, record.t_ns, record.data, record.t_ns, sequence)
+            yield True, recorder.topic_of(record.device, record.direction), recorder.RAW, message, record
 
 
 @contextmanager
 def _decoding(
     capture: recorder.Capture, writer: Writer, leave_bytes: int | None
-) -> Iterator[Callable[[recorder.Record | recorder.Event | None], int]]:
+) -> Iterator[Callable[[Record | Event | None], int]]:
     """Give what takes each item, and None for the end, and writes what they mean; it counts what it wrote.
 
     Raises _NotDecoded, also for a bug in it: nothing may cost what was recorded.
@@ -189,7 +233,7 @@ def _decoding(
 
     folder, taken = capture.path.parent, count(1)
 
-    def decode(item: recorder.Record | recorder.Event | None) -> int:
+    def decode(item: Record | Event | None) -> int:
         if next(taken) % _LOOK_EVERY == 0 and shutil.disk_usage(folder).free < leave_bytes:
             raise _NotDecoded(_NO_ROOM)
         try:
@@ -227,12 +271,12 @@ def _words(error: Exception) -> str:
 def _digest(capture: recorder.Capture) -> bytes:
     digest = hashlib.sha256()
     for channel, body, _ in capture.messages():
-        digest.update(_identity(channel, recorder.message_of(body)))
+        digest.update(_identity(channel.topic, recorder.message_of(body)))
     return digest.digest()
 
 
-def _identity(channel: Channel, message: Message) -> bytes:
-    head = (channel.topic, message.log_time, message.publish_time, message.sequence, len(message.data))
+def _identity(topic: str, message: Message) -> bytes:
+    head = (topic, message.log_time, message.publish_time, message.sequence, len(message.data))
     return repr(head).encode() + message.data
 
 
@@ -287,6 +331,8 @@ class Finaliser:
             path, has_ended = item
             if not is_indexed(path):
                 self._run(path)
+            else:
+                tail.beside(path).unlink(missing_ok=True)
             if has_ended:
                 self._report(path.parent)
 

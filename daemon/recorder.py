@@ -124,7 +124,7 @@ class Recorder:
 
     def write(self, device: str, direction: Direction, t_ns: int, data: bytes) -> None:
         """Record a chunk. Raises RecorderError: this chunk is lost, the file is whole."""
-        self._message(f"/{device}/{direction}", RAW, t_ns, data)
+        self._message(topic_of(device, direction), RAW, t_ns, data)
 
     def event(self, t_ns: int, content: dict[str, Any]) -> None:
         """Record what the daemon did or noticed. Raises RecorderError, as `write` does."""
@@ -371,6 +371,11 @@ def read(path: Path) -> Capture:
 
 class _Cut(Exception):
     """The file goes no further, though it was not closed there; the message says what is wrong."""
+
+
+def topic_of(device: str, direction: Direction) -> str:
+    """Give the topic of a line's chunks."""
+    return f"/{device}/{direction}"
 
 
 def message_of(body: bytes) -> Message:

@@ -26,6 +26,7 @@ from polecal.daemon.route import Stand
 from polecal.daemon.routine import ENDED, State
 from polecal.daemon.sessions import CALIBRATION, Session, SessionError
 from polecal.daemon.space import MAKE_ROOM, Space
+from polecal.daemon.tail import Tail
 from polecal.daemon.writer import Writer
 from polecal.drivers.device import Device
 from polecal.drivers.errors import DeviceError, DeviceProtocolError
@@ -99,6 +100,8 @@ class Run:
             ),
         ]
         self._recorder = Recorder(session.capture, session.metadata(config))
+        self._runtime_dir = config.runtime_dir
+        self._tail: Tail | None = None
         self._space = Space(config.state_dir, config.storage)
         self._writer = Writer(self._recorder, self._space, session.id)
         self._stops = [threading.Event() for _ in self._devices]
@@ -137,7 +140,9 @@ class Run:
         problems: list[DeviceError] = []
         with contextlib.ExitStack() as undo:
             undo.callback(self.ended.set)
+            undo.callback(self._forget)
             undo.callback(self._recorder.close)
+            self._keep()
             for device, stop in zip(self._devices, self._stops, strict=True):
                 try:
                     ports.append(device.open(stop))
@@ -285,9 +290,24 @@ class Run:
 
     def _tap(self, name: str) -> Tap:
         def tap(direction: Direction, t_ns: int, data: bytes) -> None:
-            self._writer.put(Record(name, direction, t_ns, data))
+            record = Record(name, direction, t_ns, data)
+            if self._tail is not None:
+                self._tail.put(record)
+            self._writer.put(record)
 
         return tap
+
+    def _keep(self) -> None:
+        """Begin a tail; a run without one may only lose more by a kill."""
+        names = [device.name for device in self._devices]
+        try:
+            self._tail = Tail(self._runtime_dir, self.session.capture, names)
+        except OSError as error:
+            self._log.warning("no tail", folder=str(self._runtime_dir), problem=error.strerror)
+
+    def _forget(self) -> None:
+        if self._tail is not None:
+            self._tail.close()
 
     def _work(self) -> None:
         """Hear what was recorded until every device is left, and nothing waits."""
@@ -301,6 +321,7 @@ class Run:
             self._log.warning("capture cut off", problem=str(error), hint=error.hint)
         except RecorderError as error:
             self._fail(error)
+        self._forget()
         while (item := self._writer.get(0.0)) is not None:
             self._do(item)
         if self._unwritten:

@@ -19,7 +19,7 @@ from typing import Any
 import structlog
 
 from polecal import PolecalError, __version__
-from polecal.daemon import archive, log, reporting, route, sessions, shelf
+from polecal.daemon import archive, log, reporting, route, sessions, shelf, tail
 from polecal.daemon.config import SPAN, Config, load
 from polecal.daemon.control import Code, ControlServer, Refused, asker, code_of
 from polecal.daemon.finalise import Finaliser
@@ -327,6 +327,10 @@ def _serve(path: str, config: Config) -> int:
                 "make it, or let systemd start polecal",
                 Code.NOT_PERMITTED if isinstance(error, PermissionError) else Code.CONFIG,
             ) from error
+    try:
+        tail.rescue(config.runtime_dir)
+    except (OSError, ValueError) as error:
+        structlog.get_logger().warning("no tail rescued", problem=str(error))
     manager = Manager()
     finaliser = Finaliser(
         config.state_dir, config.storage.min_free_mb * 1_000_000, decoded=config.storage.decoded

@@ -24,7 +24,7 @@ from polecal.daemon.space import MAKE_ROOM, Space
 
 _UNDER_WAY = 50_000  # minutes of both devices, written or not: beyond it the readers wait
 _SYNC_S = 0.5  # what is written may wait for so long again, in a silence: a power cut takes 1 s at most
-_TOGETHER_S = 0.02  # between two looks at what came: waking for each chunk costs more than writing it
+_TOGETHER_S = 0.05  # between two looks at what came: waking for each chunk costs more than writing it
 _COUNT_S = 10.0  # between two sums of what all sessions take: some 0.5 MB are recorded meanwhile
 _BUG = "report it with the session's folder"
 

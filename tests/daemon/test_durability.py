@@ -16,6 +16,7 @@ import pytest
 from polecal.daemon import recorder
 from polecal.daemon.config import dump
 from polecal.daemon.finalise import finalise, is_indexed
+from polecal.daemon.tail import rescue
 
 KILLS = 50
 LOST_BY_A_POWER_CUT_S = 1.0
@@ -46,6 +47,7 @@ class Said:
             return  # one thread says both, as they lie in the drive
         for n, (device, t_ns, data) in enumerate(chunks):
             taps[device]("rx", t_ns, data)
+            tell("read", device, t_ns)
             if n % 20 == 0:
                 time.sleep(pause_s)
         time.sleep(60)
@@ -124,6 +126,7 @@ class Told:
         ]
         self.lines = lines
         self.folder = Path(self.of("session")[0][0])
+        self.read = [tuple(rest) for rest in self.of("read")]
         self.written = [tuple(rest) for rest in self.of("wrote")]
         self.passes = dict(self.of("pass"))
 
@@ -136,7 +139,9 @@ def killed(recorded, drive, settings, tmp_path):
     """Begins the daemon's run again and again, and kills each so many seconds after what it told first."""
 
     def kill(moments, *, at_once, pause_s):
-        config = settings(state_dir=str(tmp_path / "state"), routine={"min_passes": 99})
+        (tmp_path / "run").mkdir()
+        folders = {"state_dir": str(tmp_path / "state"), "runtime_dir": str(tmp_path / "run")}
+        config = settings(**folders, routine={"min_passes": 99})
         (tmp_path / "polecal.yaml").write_text(dump(config))
         first_ns = recorded.played.passes[0][1].t_ns[0] - 4 * 10**9
         (tmp_path / "chunks").write_bytes(
@@ -182,6 +187,28 @@ def test_fifty_kills_lose_no_message_and_no_pass_and_every_session_is_repaired(k
     tell(f"{KILLS} kills: {messages} messages and {passes} passes told, none lost")
     assert messages > 100 * KILLS
     assert passes > 0
+
+
+def test_a_kill_loses_nothing_that_was_read_though_it_was_not_written_yet(killed, tmp_path, tell):
+    rng = random.Random(11)
+    runs = killed([("wrote", rng.uniform(0.2, 0.6)) for _ in range(12)], at_once=4, pause_s=0.02)
+    rescue(tmp_path / "run")
+    from_tail = []
+    for run in runs:
+        path = run.folder / "capture.mcap"
+        before = list(recorder.read(path))
+        done = finalise(path)
+        after = list(recorder.read(path))
+        assert after[: len(before)] == before
+        assert len(after) - len(before) == done.from_tail
+        found = records(after)
+        assert len(found) == len(set(found))
+        assert found[: len(run.read)] == run.read
+        assert len(found) <= len(run.read) + 1  # the one that was read and not yet told
+        assert [one.name for one in run.folder.glob(".*")] == []
+        from_tail.append(done.from_tail)
+    tell(f"{len(runs)} kills: {sum(from_tail)} chunks were read and not written yet, none lost")
+    assert max(from_tail) > 0
 
 
 def on_disk(run, inodes):
