@@ -51,7 +51,7 @@ _SETTLE_NS = 1_000_000_000
 _STALE_NS = 5_000_000_000  # what comes once a second has ceased
 _SILENT_NS = 1_000_000_000
 _EVER_NS = 1 << 63
-_INSPVAX = int(MessageId.INSPVAX)  # a plain number is compared in an eighth of the time
+_INSPVAX = MessageId.INSPVAX.name
 
 _LOGS_BESIDE = frozenset(
     {
@@ -256,16 +256,14 @@ class Navigation:
         t_ns = frame.t_first_ns
         if (status := frame.time_status) is not None and status != TimeStatus.SATTIME:
             self._time(t_ns, status)
-        message = frame.message_id
-        if message in _LOGS_BESIDE:
-            self._note(t_ns, parse(frame))
         pose = nav_state(frame)
-        if pose is None:
-            return
-        if message != _INSPVAX:
+        if pose is not None and pose.log != _INSPVAX:  # as with most frames: it says nothing else
             self._plain_ns = t_ns
-        elif self._plain_ns and t_ns - self._plain_ns < _SILENT_NS:
-            return  # it came for its standard deviations
+        else:
+            if frame.message_id in _LOGS_BESIDE:
+                self._note(t_ns, parse(frame))
+            if pose is None or (self._plain_ns and t_ns - self._plain_ns < _SILENT_NS):
+                return  # INSPVAX came for its standard deviations
         self._use(pose, t_ns, round(t_ns - frame.lead_bytes * self._byte_ns))
 
     def _note(self, t_ns: int, said: object) -> None:

@@ -10,6 +10,7 @@ import threading
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from operator import itemgetter
 from pathlib import Path
@@ -61,6 +62,9 @@ class Record(NamedTuple):  # made in half a dataclass's time: there are hundreds
     direction: Direction
     t_ns: int
     data: bytes
+
+
+_record = partial(tuple.__new__, Record)  # as Record._make does, in two thirds of Record's time
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,7 +298,7 @@ class Capture:
                         raise _Cut("is damaged (a message on a channel that is not there)") from error
                     if line is not None:
                         data = body[_MESSAGE_HEAD.size :]
-                        item = _event(t_ns, data) if line == _EVENT_LINE else Record(*line, t_ns, data)
+                        item = _event(t_ns, data) if line == _EVENT_LINE else _record((*line, t_ns, data))
                         count += 1
                         first_ns, last_ns = first_ns or t_ns, t_ns
                         yield channel, body, item

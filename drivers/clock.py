@@ -111,7 +111,8 @@ class Clock:
             late_ns = y - self._offset_ns - self._slope * x
             # What nobody read for seconds comes at once, the oldest the latest: of that nothing is to be
             # learnt. So at first it counts how much less late than the first it is, beyond what drift can do.
-            early_ns = -late_ns if self.locked else -y - self._max_drift * x
+            locked = self._last_ns - self._first_ns >= self._settle_ns
+            early_ns = -late_ns if locked else -y - self._max_drift * x
             if x < self._last_ns or late_ns > _JUMP_NS or early_ns > _EARLY_NS:
                 self.resets += 1
                 self._clear()
