@@ -172,6 +172,7 @@ class Decoder:
         }
         self._pipeline = Pipeline(
             self._config,
+            folder=folder,
             on_pass=self._keep,
             on_scan=self._scan,
             on_pose=self._pose,
@@ -181,7 +182,7 @@ class Decoder:
         self._first_ns: int | None = None
         self._clock_ns: int | None = None
         self._before: dict[str, int] = {}
-        self._kept: list[tuple[str, StoredPass]] = []  # without their returns, which are in the file
+        self._kept: list[tuple[str, StoredPass]] = []  # without returns, which are in the file, and sums
         self._returns: IO[bytes] = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - until closed
 
     @property
@@ -273,7 +274,9 @@ class Decoder:
         columns = [getattr(stored.returns, name) for name in _NAMES]
         np.save(self._returns, np.column_stack(columns))
         gps_ns = stored.gps_ns[[stored.gps_ns.argmin(), stored.gps_ns.argmax()]]
-        self._kept.append((laser, replace(stored, returns=stored.returns[:0], gps_ns=gps_ns)))
+        bare = replace(stored.moments, totals={})
+        left = replace(stored, returns=stored.returns[:0], gps_ns=gps_ns, blocks={}, moments=bare)
+        self._kept.append((laser, left))
 
     def _write_pass(
         self, laser: str, stored: StoredPass, row: dict[str, Any], found: _Calibrated | None
