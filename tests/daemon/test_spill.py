@@ -72,10 +72,15 @@ def test_a_folder_that_takes_no_file_is_done_without(tmp_path, arrays):
     assert spill.put(arrays[0]) is arrays[0]
 
 
-def test_what_the_disk_does_not_give_back_is_told_and_where_it_comes_from_again(tmp_path, arrays):
+@pytest.mark.parametrize(
+    "fail",
+    [lambda file: os.ftruncate(file, 1000), lambda file: os.pwrite(file, bytes(4096), 8192)],
+    ids=["cut off", "a page lost"],
+)
+def test_what_the_disk_does_not_give_back_is_told_and_where_it_comes_from_again(tmp_path, arrays, fail):
     spill = Spill(tmp_path, in_memory_bytes=0)
     held = spill.put(arrays[0])
-    os.ftruncate(spill._file, 1000)
+    fail(spill._file)
     with pytest.raises(RecorderError, match="cannot be read back") as error:
         held()
     assert "replay" in error.value.hint
