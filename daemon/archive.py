@@ -30,7 +30,17 @@ from polecal.daemon.quality import Quality
 from polecal.daemon.recorder import Event, RecorderError
 from polecal.daemon.replay import BEGIN, CHOICE
 from polecal.daemon.routine import State
-from polecal.daemon.sessions import CALIBRATION, FACTS, QUALITY, Session, SessionError, captures_of, folders
+from polecal.daemon.sessions import (
+    FACTS,
+    QUALITY,
+    REPLAY,
+    Session,
+    SessionError,
+    captures_of,
+    folders,
+    read_calibration,
+    read_yaml,
+)
 from polecal.daemon.spill import Spill
 
 _OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "page", "port")
@@ -109,7 +119,7 @@ def past_of(folder: Path) -> Past:
     for path in sorted((folder / "passes").glob("*.npz"), key=lambda each: (len(each.name), each.name)):
         passes.setdefault(path.stem.rpartition("-")[0], []).append(read_pass(path).spilled(spill))
     every = {name: sorted({one.where for one in kept}) for name, kept in passes.items()}
-    content = calibration(folder)
+    content = read_calibration(folder)
     if content is not None and content.get("captures", 1) == len(captures):
         poles = {
             laser["name"]: [(each["site"], each["place"]) for each in laser["reflectors"]]
@@ -134,17 +144,6 @@ def past_of(folder: Path) -> Past:
     return Past(site=len(captures), passes=passes, poles=poles, choices=choices)
 
 
-def calibration(folder: Path) -> dict[str, Any] | None:
-    """Read a session's ``calibration.yaml``, None where there is none. Raises SessionError."""
-    path = folder / CALIBRATION
-    if not path.exists():
-        return None
-    content = _yaml(path)
-    if "state" not in content or not content.get("lasers"):
-        raise SessionError(f"{path}: is no calibration", _REPLAY)
-    return content
-
-
 def read_pass(path: Path) -> Kept:
     """Read a pass's file, also of a version that wrote less into it. Raises SessionError."""
     try:
@@ -167,7 +166,7 @@ def read_pass(path: Path) -> Kept:
                 int(file["place"]), (first_ns, last_ns), Pass.of(number, blocks, site), about, quality
             )
     except DAMAGE as error:
-        raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
+        raise SessionError(f"{path}: cannot be read: {error}", REPLAY) from error
 
 
 def _blocks(file: Mapping[str, NDArray[Any]]) -> list[Moments]:
@@ -193,9 +192,6 @@ def _origin(content: dict[str, Any]) -> tuple[float, float, float] | None:
     return None if origin is None else (origin["lat_deg"], origin["lon_deg"], origin["height_m"])
 
 
-_REPLAY = "make it anew from the capture: `polecal-field replay`"
-
-
 def _told_value(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
@@ -203,20 +199,10 @@ def _told_value(value: Any) -> Any:
 def told(folder: Path) -> tuple[dict[str, Any], Config]:
     """Read what a session was told at its start, and its configuration. Raises SessionError, ConfigError."""
     path = folder / "session.yaml"
-    metadata = _yaml(path)
+    metadata = read_yaml(path)
     if not {"created", "config"} <= metadata.keys():
-        raise SessionError(f"{path}: does not say how the session was made", _REPLAY)
+        raise SessionError(f"{path}: does not say how the session was made", REPLAY)
     return metadata, configuration.loads(metadata["config"], str(path))
-
-
-def _yaml(path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506
-    except DAMAGE as error:
-        raise SessionError(f"{path}: cannot be read: {error}", _REPLAY) from error
-    if not isinstance(content, dict):
-        raise SessionError(f"{path}: is not what polecal writes", _REPLAY)
-    return content
 
 
 def _recorded(capture: Path) -> tuple[tuple[Choice, ...], dict[str, list[tuple[int, int]]]]:

@@ -325,9 +325,13 @@ def _stop(arguments: argparse.Namespace) -> int:
 
 def _result(arguments: argparse.Namespace) -> int:
     if arguments.session and os.sep in arguments.session:
-        from polecal.daemon.sessions import read_calibration  # noqa: PLC0415
+        from polecal.daemon.sessions import CALIBRATION, SessionError, read_calibration  # noqa: PLC0415
 
-        answer = {"class": "RESULT"} | read_calibration(Path(arguments.session))
+        if (found := read_calibration(Path(arguments.session))) is None:
+            raise SessionError(
+                f"{arguments.session}: has no {CALIBRATION}", "name a session's or a replay's folder with one"
+            )
+        answer = {"class": "RESULT"} | found
     else:
         with Client(arguments.socket, _ANSWER_S) as client:
             answer = client.request({"class": "RESULT", "session": arguments.session})

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from polecal import PolecalError, __version__
 from polecal.calib import CalibrationError, Mount, Pass, Returns, estimate
@@ -32,7 +31,7 @@ from polecal.daemon.config import SPAN, Config, Laser
 from polecal.daemon.navigation import name_of
 from polecal.daemon.recorder import Event, RecorderError
 from polecal.daemon.routine import State
-from polecal.daemon.sessions import CALIBRATION, CAPTURED_IN, SessionError, captures_of
+from polecal.daemon.sessions import CAPTURED_IN, SessionError, captures_of
 from polecal.drivers.novatel_span import Framer, accuracy, nav_state, parse
 
 if TYPE_CHECKING:  # matplotlib is an extra
@@ -132,9 +131,7 @@ def _page(folder: Path) -> Page:
 
     meta, home = _metadata(folder)
     config = configuration.loads(meta["config"], str(folder / "session.yaml"))
-    content: dict[str, Any] = {}
-    if (folder / CALIBRATION).exists():
-        content = sessions.read_calibration(folder)
+    content = sessions.read_calibration(folder) or {}
     notes: list[str] = []
     heard = _listen(home, notes)
     lasers, passes_ns = [], []
@@ -187,17 +184,14 @@ def _still_to_drive(folder: Path) -> Sequence[Leg]:
 def _metadata(folder: Path) -> tuple[dict[str, str], Path]:
     """Find what a session was told, and the folder of its captures: of a replay, the one it was made from."""
     path = folder / "session.yaml"
-    try:
-        told = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+    if not path.exists():
         raise SessionError(
             f"{folder}: is no session's folder", "name one with a session.yaml in it, or replay its capture"
-        ) from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise SessionError(f"{path}: cannot be read: {error}", "replay the session's capture") from error
-    if isinstance(told, dict) and {"session", "config"} <= told.keys():
+        )
+    told = sessions.read_yaml(path)
+    if {"session", "config"} <= told.keys():
         return told, Path(told.get(CAPTURED_IN, folder))
-    raise SessionError(f"{path}: does not say how the session was made", "replay the session's capture")
+    raise SessionError(f"{path}: does not say how the session was made", sessions.REPLAY)
 
 
 def _facts(meta: Mapping[str, str], folder: Path, content: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -33,10 +33,12 @@ CAPTURED_IN = "captured_in"
 """What ``session.yaml`` calls the folder with the captures, where it is another one: of a replay."""
 CAPTURES = "capture*.mcap"
 """Matches all captures of a session's folder."""
+REPLAY = "make it anew from the capture: `polecal-field replay`"
 _LATER = "capture-{}.mcap"
 _STAMP = "%Y%m%dT%H%M%SZ"
 _STAMPED = re.compile(r"(\d{8}T\d{6}Z)-")
 _NUMBERED = re.compile(r"capture(?:-(\d+))?\.mcap")
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class SessionError(PolecalError):
@@ -203,10 +205,15 @@ def calibration_of(state_dir: Path, session: str | None) -> dict[str, Any]:
     inside = (state_dir / "sessions").resolve()
     for folder in reversed(folders(state_dir)):
         file = folder / CALIBRATION
-        if session not in (None, folder.name) or not file.is_file() or file.resolve().parent.parent != inside:
+        if session not in (None, folder.name) or (file.is_file() and file.resolve().parent.parent != inside):
             continue
-        content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
-        if session is not None or content["state"] == "accepted":
+        try:
+            content = read_calibration(folder)
+        except SessionError:
+            if session is not None:
+                raise
+            continue  # an older one may be whole
+        if content is not None and (session is not None or content["state"] == "accepted"):
             return content
     wanted = f"session {session} has no calibration" if session else "no session was accepted yet"
     raise SessionError(wanted, "see `polecal-field status` for what is still to be driven")
@@ -221,16 +228,25 @@ def folder_of(state_dir: Path, session: str | None) -> Path:
     raise SessionError(what, f"see {state_dir / 'sessions'}")
 
 
-def read_calibration(folder: Path) -> dict[str, Any]:
-    """Read the calibration in a folder, of a session or of a replay. Raises SessionError."""
+def read_calibration(folder: Path) -> dict[str, Any] | None:
+    """Read the calibration of a session or of a replay, None where there is none. Raises SessionError."""
     path = folder / CALIBRATION
+    if not path.exists():
+        return None
+    content = read_yaml(path)
+    if "state" not in content or not isinstance(content.get("lasers"), list):
+        raise SessionError(f"{path}: is no calibration", REPLAY)
+    return content
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a file that `Session` wrote. Raises SessionError."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        why = error.strerror if isinstance(error, OSError) else "is no calibration"
-        raise SessionError(f"{path}: {why}", "name a folder with a calibration.yaml in it") from error
-    if not isinstance(content, dict) or not isinstance(content.get("lasers"), list):
-        raise SessionError(f"{path}: is no calibration", "name a folder with a calibration.yaml in it")
+        content = yaml.load(path.read_bytes(), _LOADER)  # noqa: S506
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise SessionError(f"{path}: cannot be read: {error}", REPLAY) from error
+    if not isinstance(content, dict):
+        raise SessionError(f"{path}: is not what polecal writes", REPLAY)
     return content
 
 

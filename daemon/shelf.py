@@ -9,7 +9,7 @@ import yaml
 
 from polecal import PolecalError
 from polecal.daemon import archive
-from polecal.daemon.sessions import captures_of
+from polecal.daemon.sessions import captures_of, read_calibration
 from polecal.daemon.space import preserved, size_of
 
 UNFINISHED = "unfinished"
@@ -37,7 +37,7 @@ def _row(folder: Path, running: tuple[str, str] | None) -> dict[str, Any]:
     }
     try:
         row["created"] = archive.told(folder)[0]["created"]
-        content = archive.calibration(folder)
+        content = read_calibration(folder)
         if content is not None:
             row["cost_m"] = {laser["name"]: laser["cost_m"] for laser in content["lasers"]}
             if content.get("captures", 1) == captures:

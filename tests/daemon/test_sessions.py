@@ -55,7 +55,7 @@ def test_a_calibration_is_read_back_and_leaves_nothing_else(tmp_path, config):
 @pytest.mark.parametrize("broken", ["fsync", "rename"])
 def test_a_file_that_cannot_be_finished_leaves_the_old_one_whole(tmp_path, config, monkeypatch, broken):
     session = sessions.create(tmp_path, config, None)
-    session.write_calibration({"state": "accepted"})
+    session.write_calibration({"state": "accepted", "lasers": []})
     if broken == "fsync":
         monkeypatch.setattr(os, "fsync", full)
     else:
@@ -64,7 +64,7 @@ def test_a_file_that_cannot_be_finished_leaves_the_old_one_whole(tmp_path, confi
         session.write_calibration({"state": "rejected"})
     assert caught.value.hint
     monkeypatch.undo()
-    assert sessions.calibration_of(tmp_path, None) == {"state": "accepted"}
+    assert sessions.calibration_of(tmp_path, None) == {"state": "accepted", "lasers": []}
     assert sorted(each.name for each in session.folder.iterdir()) == [CALIBRATION, "passes", "session.yaml"]
 
 
@@ -111,6 +111,17 @@ def test_the_last_accepted_one_is_found_or_the_one_named(tmp_path):
     assert sessions.calibration_of(tmp_path, "20260103T000000Z-front")["state"] == "rejected"
     with pytest.raises(SessionError, match="20260104T000000Z-front has no calibration"):
         sessions.calibration_of(tmp_path, "20260104T000000Z-front")
+
+
+@pytest.mark.parametrize("damage", ["state: [", "\0", "a list", "state: accepted"])
+def test_one_that_is_damaged_hides_none_before_it_and_is_told_where_it_is_named(tmp_path, damage):
+    write(tmp_path, "20260101T000000Z-front", "accepted")
+    write(tmp_path, "20260102T000000Z-front", "accepted")
+    (tmp_path / "sessions" / "20260102T000000Z-front" / CALIBRATION).write_text(damage)
+    assert sessions.calibration_of(tmp_path, None)["session"] == "20260101T000000Z-front"
+    with pytest.raises(SessionError, match="20260102T000000Z-front/calibration") as caught:
+        sessions.calibration_of(tmp_path, "20260102T000000Z-front")
+    assert "polecal-field replay" in caught.value.hint
 
 
 @pytest.mark.parametrize("name", [None, "20260103T000000Z-front", "../../etc", ""])
