@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,9 +111,9 @@ class LaserChannel:
         self._scan_revolutions = int(np.ceil(ages_s.max() / REVOLUTION_S))
         self._byte_ns = BITS_PER_BYTE * 1e9 / laser.baud
 
-    def feed(self, t_ns: int, data: bytes) -> bool:
-        """Take a chunk that was read at host time ``t_ns``; say whether a telegram ended in it."""
-        frames = self.framer.feed(data, t_ns)
+    def feed(self, chunks: Sequence[tuple[bytes, int]]) -> bool:
+        """Take chunks, each with the host time at which it was read; say whether a telegram ended in them."""
+        frames = self.framer.feed_all(chunks)
         for frame in frames:
             if frame.command not in _SCANS:
                 continue

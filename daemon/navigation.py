@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -194,16 +194,14 @@ class Navigation:
         self._inertial_type = False  # position_type is that of the inertial solution itself
         self._accuracy: Accuracy | None = None
 
-    def feed(self, t_ns: int, data: bytes) -> bool:
-        """Take a chunk that was read at host time ``t_ns`` (CLOCK_MONOTONIC ns); say if a frame ended."""
-        self._now_ns = t_ns
-        frames = self.framer.feed(data, t_ns)
-        if not frames:  # as with most chunks
-            return False
+    def feed(self, chunks: Sequence[tuple[bytes, int]]) -> bool:
+        """Take chunks, each with the host time (CLOCK_MONOTONIC ns) of its reading; say if a frame ended."""
+        self._now_ns = chunks[-1][1]
+        frames = self.framer.feed_all(chunks)
         for frame in frames:
             if frame.kind.checked and not frame.is_response and self._copies.is_new(frame):
                 self._take(frame)
-        return True
+        return bool(frames)
 
     def tick(self, t_ns: int) -> None:
         """Let time go on to host time ``t_ns``, whether or not anything came."""
@@ -212,7 +210,12 @@ class Navigation:
     @property
     def lost(self) -> bool:
         """Whether there has been no pose to use for 2 s, or none ever."""
-        return not self._used_ns or self._now_ns - self._used_ns > _LOST_NS
+        return not self._used_ns or self._now_ns > self.lost_ns
+
+    @property
+    def lost_ns(self) -> int:
+        """From when on it is `lost`, if there is no other pose to use."""
+        return self._used_ns + _LOST_NS
 
     @property
     def ready(self) -> bool:

@@ -45,7 +45,6 @@ OnScan = Callable[[str, int, Decoded], None]
 """Takes (laser's name, host time at which its telegram began, scan) of every scan of the right variant."""
 
 GO_ON = "it was not calibrated: go on with it by `polecal-field start --continue`"
-_COLLECTING = State.COLLECTING  # asked for with each chunk: an enum takes four times as long to find it in
 _COSTS = 40  # after the last so many passes, for who looks on
 _FEW_LEFT = 10  # passes: from then on it is said that there may be no more
 _ABSURD_SIGMAS = 20.0  # off the hand measurement: of the default 0.1 m and 5 degrees, 2 m and 100 degrees
@@ -184,6 +183,23 @@ class _LaserRun:
         return sum(min(count, self.setup.need.min_pole_returns) for count in counts.values())
 
 
+class _Line:
+    """A device's chunks, which wait until there may be a whole frame in them: most end within one."""
+
+    def __init__(self, listener: Navigation | LaserChannel) -> None:
+        self.unheard: list[tuple[bytes, int]] = []
+        self.lacking = 0
+        """How many bytes must come yet before there may be."""
+        self._listener = listener
+
+    def hear(self) -> bool:
+        """Hand them on; say whether a frame ended in them."""
+        framed = self._listener.feed(self.unheard)
+        self.unheard.clear()
+        self.lacking = self._listener.framer.lacking
+        return framed
+
+
 class Pipeline:
     """All that happens between the bytes and the verdict.
 
@@ -204,7 +220,12 @@ class Pipeline:
         on_scan: OnScan | None = None,
         on_pose: OnPose | None = None,
     ) -> None:
-        self.routine = Routine(on_transition)
+        self.routine = Routine(self._on_transition)
+        self._told = on_transition
+        self._lines: dict[str, _Line] = {}
+        """Of each device, while data is being taken."""
+        self._settled_until_ns = 0
+        """By then nothing happens but by a frame."""
         self._session, self._created = session, created
         self._on_pass = on_pass
         self._config = config
@@ -270,20 +291,17 @@ class Pipeline:
 
         Once the run has ended, nothing changes any more.
         """
-        before = self.routine.state
-        if before in ENDED:
+        line = self._lines.get(device)
+        if line is None:
             return
-        if device == SPAN:
-            framed = self._navigation.feed(t_ns, data)
-        elif device in self._lasers:
-            framed = self._lasers[device].channel.feed(t_ns, data)
-            self._navigation.tick(t_ns)
-        else:
-            return
-        settled = before is _COLLECTING and not self._navigation.lost
-        if settled and not framed:
+        line.unheard.append((data, t_ns))
+        line.lacking -= len(data)
+        if line.lacking > 0 and t_ns <= self._settled_until_ns:
             return  # as with most chunks: nothing is there that was not before
-        if not settled:
+        framed = line.hear()
+        self._navigation.tick(t_ns)
+        before = self.routine.state
+        if before is not State.COLLECTING or self._navigation.lost:
             self._advance(t_ns)
         news = self.routine.state is not before
         for laser in self._lasers.values() if framed else ():
@@ -292,6 +310,18 @@ class Pipeline:
                 news = True
         if news:  # a verdict changes with a pass, and counts while collecting
             self._conclude(t_ns)
+        if self.routine.state is State.COLLECTING:
+            self._settled_until_ns = self._navigation.lost_ns
+
+    def _on_transition(self, t_ns: int, old: State, new: State, why: str) -> None:
+        self._settled_until_ns = 0
+        if new in ENDED:
+            self._lines = {}
+        elif old in ENDED:
+            self._lines = {name: _Line(laser.channel) for name, laser in self._lasers.items()}
+            self._lines[SPAN] = _Line(self._navigation)
+        if self._told is not None:
+            self._told(t_ns, old, new, why)
 
     def tick(self, t_ns: int) -> None:
         """Let time go on to host time ``t_ns``, also where nothing comes any more."""

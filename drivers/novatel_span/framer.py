@@ -23,7 +23,7 @@ import re
 import struct
 import zlib
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -396,12 +396,23 @@ class Framer:
         self._ends: list[int] = []  # of each chunk that _rest has bytes of, the offset behind its last byte,
         self._stamps: list[int] = []  # and its stamp
 
+    @property
+    def lacking(self) -> int:
+        """How many bytes must come at least before there is another frame."""
+        return max(1, self._announced - len(self._rest))
+
     def feed(self, data: bytes, t_ns: int) -> list[Frame]:
         """Take a chunk with its stamp (CLOCK_MONOTONIC, ns); return the frames that ended in it."""
-        buffer = self._rest + data
-        self._ends.append(self._offset + len(buffer))
-        self._stamps.append(t_ns)
-        if len(buffer) < self._announced:  # most chunks end within a frame
+        return self.feed_all(((data, t_ns),))
+
+    def feed_all(self, chunks: Iterable[tuple[bytes, int]]) -> list[Frame]:
+        """Take some chunks at once."""
+        buffer, before = self._rest, self._offset
+        for data, t_ns in chunks:
+            buffer += data
+            self._ends.append(before + len(buffer))
+            self._stamps.append(t_ns)
+        if len(buffer) < self._announced:
             self._rest = buffer
             return []
         frames: list[Frame] = []

@@ -17,7 +17,7 @@ Each decision depends on the bytes alone, never on how they were split.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -93,14 +93,25 @@ class Framer:
         self._bad_until = 0
         self._verdicts: dict[int, bool] = {}  # on what stands behind an ACK, by offset: asked many times
 
+    @property
+    def lacking(self) -> int:
+        """How many bytes must come at least before there is another telegram, if none is cut off."""
+        return max(1, self._telegram_end - len(self._held))
+
     def feed(self, data: bytes, t_ns: int) -> list[Frame]:
         """Take the next bytes of the stream, read at ``t_ns``; return the telegrams that are now whole."""
-        if not data:
-            return []
+        return self.feed_all(((data, t_ns),))
+
+    def feed_all(self, chunks: Iterable[tuple[bytes, int]]) -> list[Frame]:
+        """Take the next bytes of the stream in some chunks, each with the time at which it was read."""
         at = len(self._held)
-        self._held += data
-        self._ends.append(self._start + len(self._held))
-        self._stamps.append(t_ns)
+        for data, t_ns in chunks:
+            if data:
+                self._held += data
+                self._ends.append(self._start + len(self._held))
+                self._stamps.append(t_ns)
+        if at == len(self._held):
+            return []
         if len(self._held) < self._telegram_end and self._held.find(_ACK_STX, at - 1) < 0:
             return []  # most chunks end within a telegram
         frames = self._scan(final=False)

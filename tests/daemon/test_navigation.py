@@ -52,7 +52,7 @@ class Receiver:
             head += [(12, "I", WEEK), (16, "d", (MS + self.ms) / 1000)]
         start = 12 if short else 28
         data = changed(wire, *head, *((at + start, *rest) for at, *rest in changes))
-        self.navigation.feed(T0_NS + self.ms * 1_000_000 + 2_000_000, data)
+        self.navigation.feed([(data, T0_NS + self.ms * 1_000_000 + 2_000_000)])
 
     def pose(self, *changes, name="INSPVAS", azimuth_deg=30.0, north_mps=0.0, east_mps=0.0, status=3):
         at = 84 if name == "INSPVAS" else 0
@@ -117,7 +117,7 @@ def heard(path, turned_deg=0.0):
 def after(path, **how):
     navigation = Navigation(Settings(port="/dev/span", rate_hz=20))
     for t_ns, data in heard(path, **how):
-        navigation.feed(t_ns, data)
+        navigation.feed([(data, t_ns)])
     return navigation
 
 
@@ -183,7 +183,7 @@ def test_how_the_bytes_are_cut_changes_nothing(captures):
         navigation = Navigation(Settings(port="/dev/span", rate_hz=20))
         for t_ns, data in chunks:
             for at in range(0, len(data), size):
-                navigation.feed(t_ns, data[at : at + size])
+                navigation.feed([(data[at : at + size], t_ns)])
         ends.append((navigation.why_not, navigation.device(), navigation.trajectory.last_ns))
     assert ends[0] == ends[1] == ends[2]
 
@@ -194,9 +194,9 @@ def test_copies_on_a_virtual_port_count_once(captures):
     stream = list(heard(captures / DRIVEN))
     for t_ns, data in stream:
         for frame in Framer().feed(data, 0):
-            navigation.feed(t_ns, frame.data)
+            navigation.feed([(frame.data, t_ns)])
             if frame.port_address is not None:
-                navigation.feed(t_ns, changed(frame.data, (7, "B", frame.port_address + 30)))
+                navigation.feed([(changed(frame.data, (7, "B", frame.port_address + 30)), t_ns)])
     states = [nav_state(frame) for _, data in stream for frame in Framer().feed(data, 0)]
     assert navigation.pulse.count == sum(state is not None for state in states) > 2000
 
