@@ -9,9 +9,10 @@ from polecal.calib import estimate
 from polecal.daemon.config import SPAN, loads
 from polecal.daemon.passes import StoredPass
 from polecal.daemon.pipeline import Pipeline
-from polecal.daemon.recorder import Recorder
+from polecal.daemon.recorder import Record, Recorder
 from polecal.daemon.replay import BEGIN, replay
 from polecal.daemon.results import setup_of
+from polecal.daemon.tail import Tail
 from polecal.drivers.emulated.virtual import Rig, play
 
 HEADINGS = ("what", "value", "unit")
@@ -55,6 +56,11 @@ def rows() -> Iterator[tuple[object, ...]]:
                 recorder.write(name, "rx", t_ns, data)
             took_s = time.perf_counter() - began_s
             yield "recorder: cost of a message", took_s / len(chunks) * 1e6, "µs"
+            tail = Tail(Path(folder), recorder.path, ("front", SPAN))
+            began_s = time.perf_counter()
+            for name, t_ns, data in chunks:
+                tail.put(Record(name, "rx", t_ns, data))
+            yield "tail: cost of a chunk", (time.perf_counter() - began_s) / len(chunks) * 1e6, "µs"
             yield "recorder: size", recorder.size_bytes / SECONDS * 60 / 1e6, "MB a minute"
         watch = _Watch()
         replay(recorder.path, None, None, None)
