@@ -180,7 +180,8 @@ class LaserChannel:
             self._host_jumped()
         if self._waiting and self._seen_ns - self._waiting[0].stx_ns >= _TOGETHER_NS:
             self._place_next()
-        return self._closed(self._waiting[0].stx_ns if self._waiting else self._seen_ns)
+        oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns
+        return self._closed(oldest_ns) if oldest_ns > self._builder.ends_ns else []
 
     def _host_jumped(self) -> None:
         """Learn the mirror's clock anew, as the receiver's had to be.

@@ -21,6 +21,7 @@ from polecal.daemon.trajectory import Poses
 _OUT_OF_VIEW_NS = 1_500_000_000
 _LONGEST_NS = 60_000_000_000  # bounds what is kept of a vehicle that never turns away
 _FEWEST_POLE_RETURNS = 20
+_NEVER_NS = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,8 @@ class PassBuilder:
         """Ground returns left out, as they stood out of the ground."""
         self._slice_deg = slice_deg
         self._open: dict[int, OpenPass] = {}
-        self._ends_ns = 0  # of the first of them to end
+        self.ends_ns = _NEVER_NS
+        """Host time until which nothing ends that is open now."""
         self._site, self._count = site, count
 
     def add(
@@ -124,15 +126,13 @@ class PassBuilder:
         current = self._open.setdefault(place, OpenPass(place, *t_ns, []))
         current.last_ns = t_ns[1]
         current.parts.append((gps_ns, returns))
-        self._ends_ns = min(one.ends_ns for one in self._open.values())
+        self.ends_ns = min(one.ends_ns for one in self._open.values())
 
     def close(self, mount: Mount, t_ns: int | None = None) -> list[StoredPass]:
         """Give the passes that have ended by host time ``t_ns``; all that are open if None.
 
         ``mount`` is the best known, to tell even ground from what stands on it.
         """
-        if not self._open or (t_ns is not None and t_ns <= self._ends_ns):
-            return []
         ended = [place for place, one in self._open.items() if t_ns is None or t_ns > one.ends_ns]
         closed = []
         for place in ended:
@@ -160,7 +160,7 @@ class PassBuilder:
                     facts=facts.of(returns, gps_ns),
                 )
             )
-        self._ends_ns = min((one.ends_ns for one in self._open.values()), default=0)
+        self.ends_ns = min((one.ends_ns for one in self._open.values()), default=_NEVER_NS)
         return closed
 
     @property

@@ -35,6 +35,7 @@ _DATA_END, _FOOTER = int(Opcode.DATA_END), int(Opcode.FOOTER)
 """Plain numbers: to compare with an enum's takes eight times as long, and there are hundreds in a second."""
 _RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHANNEL_TIME = struct.Struct("<H4xQ8x")  # the same, channel and log time of it
 _AT_ONCE_BYTES = 1 << 18  # that are read of a file
 _DAMAGE = (McapError, ValueError, struct.error, ZstdError)  # what the package raises on senseless bytes
 _CUT_OFF = "is cut off"
@@ -290,7 +291,7 @@ class Capture:
                             channels[channel.id] = channel, _line(channel)
                         continue
                     try:
-                        number, _, t_ns, _ = _MESSAGE_HEAD.unpack_from(body)
+                        number, t_ns = _CHANNEL_TIME.unpack_from(body)
                         channel, line = channels[number]
                     except struct.error as error:
                         raise _Cut(f"is damaged ({error})") from error

@@ -39,6 +39,7 @@ _STAMP = "%Y%m%dT%H%M%SZ"
 _STAMPED = re.compile(r"(\d{8}T\d{6}Z)-")
 _NUMBERED = re.compile(r"capture(?:-(\d+))?\.mcap")
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class SessionError(PolecalError):
@@ -77,7 +78,7 @@ class Session:
     def write_told(self, told: dict[str, str]) -> None:
         """Write ``session.yaml``: what the run was told. Raises SessionError."""
         with _whole_file(self.folder / "session.yaml") as file:
-            file.write(yaml.safe_dump(told, sort_keys=False).encode())
+            file.write(yaml.dump(told, Dumper=_DUMPER, sort_keys=False).encode())
 
     def write_pass(self, laser: str, stored: StoredPass) -> None:
         """Write a closed pass. Raises SessionError."""
@@ -111,7 +112,8 @@ class Session:
         """Write ``calibration.yaml``; give its path. Raises SessionError."""
         path = self.folder / CALIBRATION
         with _whole_file(path) as file:
-            file.write(yaml.safe_dump(calibration, sort_keys=False, allow_unicode=True).encode())
+            told = yaml.dump(calibration, Dumper=_DUMPER, sort_keys=False, allow_unicode=True)
+            file.write(told.encode())
         return path
 
 

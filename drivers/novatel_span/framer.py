@@ -439,7 +439,8 @@ class Framer:
                 break
         else:
             at = len(buffer)
-        self._skip(buffer, junk_at, at, reason)
+        if junk_at < at:
+            self._skip(buffer, junk_at, at, reason)
         self._rest = buffer[at:]
         self._offset += at
         done = bisect_right(self._ends, self._offset)
@@ -448,7 +449,8 @@ class Framer:
 
     def close(self) -> None:
         """Say that the stream has ended: what is left goes to on_skip."""
-        self._skip(self._rest, 0, len(self._rest), Fault.END)
+        if self._rest:
+            self._skip(self._rest, 0, len(self._rest), Fault.END)
         self._offset += len(self._rest)
         self._rest = b""
         self._announced = 0
@@ -462,5 +464,5 @@ class Framer:
         return Frame(offset, data, stamps[first], stamps[last], self._ends[first] - offset, kind)
 
     def _skip(self, buffer: bytes, start: int, end: int, reason: Fault) -> None:
-        if self._on_skip and end > start:
+        if self._on_skip:
             self._on_skip(Skip(self._offset + start, buffer[start:end], reason))
