@@ -93,15 +93,17 @@ def beside(capture: Path) -> Path:
 
 
 def read(path: Path) -> list[Record]:
-    """Give the chunks in a tail in the order of their times, none if there is no such file."""
+    """Give the chunks in a tail in the order of their times; none where there is no tail."""
     data = path.read_bytes() if path.exists() else b""
     lines = _about(data).get("lines", [])
     records = []
     for begin in range(_ABOUT_BYTES, len(data), _HALF_BYTES):
-        at = begin
-        while at + _HEAD.size <= begin + _HALF_BYTES and data[at] == 1:
+        at, end = begin, min(begin + _HALF_BYTES, len(data))
+        while at + _HEAD.size <= end and data[at] == 1:
             _, line, t_ns, size = _HEAD.unpack_from(data, at)
             at += _HEAD.size + size
+            if at > end or line >= len(lines):
+                break
             device, direction = lines[line]
             records.append(Record(device, direction, t_ns, data[at - size : at]))
     return sorted(records, key=lambda record: record.t_ns)
@@ -109,6 +111,8 @@ def read(path: Path) -> list[Record]:
 
 def _about(data: bytes) -> dict[str, Any]:
     """Give what a tail is of, nothing where a kill came before it was told."""
-    about = data[:_ABOUT_BYTES].rstrip(b"\0")
-    told: dict[str, Any] = json.loads(about) if about.endswith(b"}") else {}
-    return told
+    try:
+        told = json.loads(data[:_ABOUT_BYTES].rstrip(b"\0"))
+    except ValueError:
+        return {}
+    return told if isinstance(told, dict) else {}

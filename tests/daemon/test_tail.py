@@ -85,13 +85,27 @@ def test_what_a_killed_run_left_is_moved_beside_its_capture_and_only_once(tmp_pa
     assert not beside(capture).exists()
 
 
-@pytest.mark.parametrize("content", [b"", bytes(8192), b"{}"], ids=["empty", "zeros", "of nothing"])
+@pytest.mark.parametrize("content", [b"", bytes(8192), b"{}", b"[1]", b"\1" * 99999])
 def test_a_tail_that_was_killed_before_it_began_is_of_nothing(tmp_path, content):
     path = tmp_path / "one.tail"
     path.write_bytes(content)
     assert read(path) == []
     rescue(tmp_path)
     assert not path.exists()
+
+
+def test_what_a_tail_of_senseless_bytes_has_is_what_is_whole(tmp_path, capture):
+    tail = Tail(tmp_path, capture, ["span"])
+    for record in numbered(200):
+        tail.put(record)
+    whole = tail.path.read_bytes()
+    for cut in range(4096, len(whole) // 2, 9973):
+        for junk in (b"", b"\1" * 5000, b"\1\0" + bytes(8) + b"\xff" * 4, b"\1\7" * 2500):
+            tail.path.write_bytes(whole[:cut] + junk)
+            kept = read(tail.path)
+            assert [record for record in kept if record in numbered(200)] == numbered(
+                min(200, (cut - 4096) // 1014)
+            )
 
 
 def test_a_tail_whose_session_was_removed_goes_too(tmp_path, capture):
