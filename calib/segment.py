@@ -145,13 +145,19 @@ class Ground:
     _ordered_m: list[float] = field(default_factory=list)
     """The same, the lowest first."""
 
-    def beams(self, range_m: Array, reflectivity: Array, down_m: Array) -> NDArray[np.bool_]:
-        """Say which of K scans' (K, N) returns are it, ``down_m`` their z in n; NaN where there is none."""
+    def beams(
+        self, range_m: Array, reflectivity: Array, down_m: Array, *, step: int = 1
+    ) -> NDArray[np.bool_]:
+        """Say which of K scans' (K, N) returns are it; NaN where there is none.
+
+        It is looked for among each ``step``-th of them, whose z in n is ``down_m`` (K, N / step).
+        """
         bright = reflectivity > _DULL
         dull = np.isfinite(range_m) & (range_m <= _GROUND_RANGE_M) & ~bright
         for aside in range(1, _MARGIN_BEAMS + 1):
             dull[:, aside:] &= ~bright[:, :-aside]
             dull[:, :-aside] &= ~bright[:, aside:]
+        dull = dull[:, ::step]
         ordered = np.sort(np.where(dull, down_m, np.inf), axis=1)
         level_m = np.zeros(len(dull))
         for number, count in enumerate(dull.sum(axis=1).tolist()):

@@ -104,7 +104,7 @@ class LaserChannel:
         self._on_frame, self._on_scan = on_frame, on_scan
         count = round(laser.fov_deg / laser.resolution_deg) + 1
         self._bearing_rad = bearings_rad(count, laser.fov_deg, laser.resolution_deg)
-        self._sparse = np.arange(count) % max(1, round(_GROUND_DEG / laser.resolution_deg)) == 0
+        self._step = max(1, round(_GROUND_DEG / laser.resolution_deg))
         ages_s = beam_ages_s(laser.fov_deg, laser.resolution_deg, count)
         self._age_ns = np.round(ages_s * 1e9).astype(np.int64)
         self._youngest_ns = int(self._age_ns.min())
@@ -239,10 +239,9 @@ class LaserChannel:
         moving = np.flatnonzero(~standing)
         range_m = np.where(known, np.stack([scan.range_m for scan in scans]), np.nan)
         reflectivity = np.stack([scan.reflectivity for scan in scans])
-        down_m = self._down_m(np.nan_to_num(range_m), path)
-        ground = np.zeros(gps_ns.shape, dtype=bool)
-        ground[moving] = self._ground.beams(range_m[moving], reflectivity[moving], down_m[moving])
-        ground &= self._sparse
+        down_m = self._down_m(np.nan_to_num(range_m[moving, :: self._step]), path, moving)
+        ground = np.zeros((len(scans), down_m.shape[1]), dtype=bool)
+        ground[moving] = self._ground.beams(range_m[moving], reflectivity[moving], down_m, step=self._step)
         kind = np.full(gps_ns.size, Kind.GROUND, dtype=np.uint8)
 
         def returns(rows: NDArray[np.int64]) -> Returns:
@@ -255,18 +254,22 @@ class LaserChannel:
             seen[place, number].append(rows)  # one reflector may be seen in pieces
         parts: defaultdict[int, list[_Sighting]] = defaultdict(list)
         for (place, number), pieces in seen.items():
-            on_ground = np.flatnonzero(ground[number]) + number * len(self._bearing_rad)
+            on_ground = number * len(self._bearing_rad) + self._step * np.flatnonzero(ground[number])
             parts[place].append((scans[number].stx_ns, np.concatenate([*pieces, on_ground])))
         for place, sightings in parts.items():
             rows = np.concatenate([each for _, each in sightings])
             t_ns = sightings[0][0], sightings[-1][0]
             self._builder.add(place, t_ns, gps_ns.ravel()[rows], returns(rows))
 
-    def _down_m(self, range_m: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-        """Give z in n of K scans' returns at (K, N) ranges."""
+    def _down_m(
+        self, range_m: NDArray[np.float64], path: Path, scans: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Give z in n of each ``step``-th return of some scans (M,), at (M, N / step) ranges."""
         origin_m = self.mount.vector[:3]
-        rays = points_body(np.ones_like(self._bearing_rad), self._bearing_rad, self.mount) - origin_m
-        state = path.states(_DOWN_ROLL_PITCH)
+        bearing_rad = self._bearing_rad[:: self._step]
+        rays = points_body(np.ones_like(bearing_rad), bearing_rad, self.mount) - origin_m
+        beams = np.arange(0, len(self._bearing_rad), self._step)
+        state = path.states(_DOWN_ROLL_PITCH, (scans[:, None] * len(self._bearing_rad) + beams).ravel())
         down_m = state[:, 0].reshape(range_m.shape).copy()
         (down,) = rotation_rows(state[:, 1:], (2,))
         for along, ray, at_m in zip(down, rays.T, origin_m, strict=True):

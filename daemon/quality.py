@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
-from typing import NamedTuple
 
 from polecal.drivers.novatel_span import Accuracy, InsStatus, PositionType
 
@@ -35,12 +34,8 @@ class Quality:
     utc_offset_s: float = UTC_OFFSET_S
 
 
-class _Pose(NamedTuple):
-    gps_ns: int
-    used: bool
-    ins_status: InsStatus | int
-    position_type: PositionType | int | None
-    accuracy: Accuracy | None
+_Pose = tuple[int, bool, InsStatus | int, PositionType | int | None, Accuracy | None]
+"""GPS time, whether it was used, status, what the position rests on, and standard deviations."""
 
 
 class QualityLog:
@@ -59,25 +54,23 @@ class QualityLog:
         accuracy: Accuracy | None,
     ) -> None:
         """Take a pose, used or not, and what was known beside it."""
-        self._poses.append(_Pose(gps_ns, used, ins_status, position_type, accuracy))
+        self._poses.append((gps_ns, used, ins_status, position_type, accuracy))
 
     def over(self, first_ns: int, last_ns: int) -> Quality:
         """Give the worst between two GPS times."""
-        poses = [pose for pose in self._poses if first_ns <= pose.gps_ns <= last_ns]
+        poses = [pose for pose in self._poses if first_ns <= pose[0] <= last_ns]
         if not poses:
             return Quality(utc_offset_s=self.utc_offset_s)
-        status = max(
-            (pose.ins_status for pose in poses), key=lambda said: said != InsStatus.INS_SOLUTION_GOOD
-        )
-        # Both stay as they are for many poses: each is looked at once.
-        types = [said for said, _ in groupby(pose.position_type for pose in poses) if said is not None]
-        told = [said for said, _ in groupby(pose.accuracy for pose in poses) if said is not None]
+        _, used, *columns = zip(*poses, strict=True)
+        # They stay as they are for many poses: each is looked at once.
+        statuses, types, told = ([said for said, _ in groupby(of) if said is not None] for of in columns)
+        status = max(statuses, key=lambda said: said != InsStatus.INS_SOLUTION_GOOD)
         return Quality(
             ins_status=_name(status),
             position_type=_name(max(types, key=_rank)) if types else None,
             position_sigma_m=_most(max(each.position_m[:2]) for each in told),
             azimuth_sigma_deg=_most(each.attitude_deg[2] for each in told),
-            unused_poses=sum(not pose.used for pose in poses),
+            unused_poses=used.count(False),
             utc_offset_s=self.utc_offset_s,
         )
 
