@@ -725,12 +725,13 @@ def _cost7(q7: Array, turns: Array) -> Array:
 
 def _h(vector: Array) -> Array:
     """Give h⁺ (36,)."""
-    time_s, range_m = vector[6:8]
-    h = np.empty(WIDTH)
-    h[:6] = rotation(vector[3:6])[:, :2].T.ravel()
-    h[6:9], h[9] = vector[:3], 1.0
-    h[RANGE], h[TIME], h[TIME_SQUARED] = range_m * h[:6], time_s * h[BASE], time_s**2 * h[BASE]
-    return h
+    values = vector.tolist()  # of so few numbers lists take a third of arrays' time
+    time_s, range_m = values[6:8]
+    rows = rotation(vector[3:6]).tolist()
+    columns = [row[column] for column in range(2) for row in rows]
+    base = [*columns, *values[:3], 1.0]
+    scaled = [scale * each for scale in (time_s, time_s**2) for each in base]
+    return np.array([*base, *(range_m * each for each in columns), *scaled])
 
 
 def _h_base(vector: Array) -> Array:
@@ -760,16 +761,17 @@ def _h_gradient(vector: Array, h: Array) -> Array:
 
 def _pole_weights(vector: Array) -> tuple[Array, Array]:
     """Give the weights of n's axes in north and east of the pole (2, 3), and their derivative (2, 3, 12)."""
-    gradient = np.zeros((2, 3, len(UNKNOWNS)))
-    gradient[0, 2, 8] = gradient[1, 2, 9] = 1.0
-    return np.array([[1.0, 0.0, vector[8]], [0.0, 1.0, vector[9]]]), gradient
+    return np.array([[1.0, 0.0, vector[8]], [0.0, 1.0, vector[9]]]), _POLE_SLOPES
 
 
 def _ground_weights(vector: Array) -> tuple[Array, Array]:
     """Give the weights of n's axes in down of the ground (1, 3), and their derivative (1, 3, 12)."""
-    gradient = np.zeros((1, 3, len(UNKNOWNS)))
-    gradient[0, 0, 10] = gradient[0, 1, 11] = 1.0
-    return np.array([[vector[10], vector[11], 1.0]]), gradient
+    return np.array([[vector[10], vector[11], 1.0]]), _GROUND_SLOPES
+
+
+_POLE_SLOPES, _GROUND_SLOPES = np.zeros((2, 3, len(UNKNOWNS))), np.zeros((1, 3, len(UNKNOWNS)))
+_POLE_SLOPES[[0, 1], 2, [8, 9]] = 1.0
+_GROUND_SLOPES[0, [0, 1], [10, 11]] = 1.0
 
 
 def _upward(hessian: Array) -> Array:
