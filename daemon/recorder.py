@@ -43,8 +43,6 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAME_ONE = "name a capture.mcap of polecal"
 
 Direction = Literal["rx", "tx"]
-_Line = tuple[str, Direction]
-_EVENT_LINE: _Line = ("", "rx")  # stands for that of the events, which are no device's
 _R = TypeVar("_R", Channel, Chunk, DataEnd)
 
 
@@ -281,25 +279,25 @@ class Capture:
         """Give each message that was recorded, as it lies in the file (see `message_of`), and its meaning."""
         self.cut, self.damaged, self.used_bytes = None, False, 0
         count, first_ns, last_ns = 0, 0, 0
-        channels: dict[int, tuple[Channel, _Line | None]] = {}
+        channels: dict[int, tuple[Channel, str | None, Direction]] = {}
         try:
             with self.path.open("rb") as stream:
                 for opcode, body in self._walk(stream):
                     if opcode != _MESSAGE:
                         if opcode == _CHANNEL:
                             channel = _read(Channel, body)
-                            channels[channel.id] = channel, _line(channel)
+                            channels[channel.id] = channel, *_line(channel)
                         continue
                     try:
                         number, t_ns = _CHANNEL_TIME.unpack_from(body)
-                        channel, line = channels[number]
+                        channel, device, direction = channels[number]
                     except struct.error as error:
                         raise _Cut(f"is damaged ({error})") from error
                     except KeyError as error:
                         raise _Cut("is damaged (a message on a channel that is not there)") from error
-                    if line is not None:
+                    if device is not None:
                         data = body[_MESSAGE_HEAD.size :]
-                        item = _event(t_ns, data) if line == _EVENT_LINE else _record((*line, t_ns, data))
+                        item = _record((device, direction, t_ns, data)) if device else _event(t_ns, data)
                         count += 1
                         first_ns, last_ns = first_ns or t_ns, t_ns
                         yield channel, body, item
@@ -429,10 +427,10 @@ def _event(t_ns: int, data: bytes) -> Event:
     return Event(t_ns, content)
 
 
-def _line(channel: Channel) -> _Line | None:
-    """Tell the device and the direction that a channel is of; None if it was not recorded but decoded."""
+def _line(channel: Channel) -> tuple[str | None, Direction]:
+    """Tell the device and the direction that a channel is of: "" of events, None if it was decoded."""
     if channel.topic == EVENTS:
-        return _EVENT_LINE
+        return "", "rx"
     device, _, direction = channel.topic.removeprefix("/").rpartition("/")
-    recorded = channel.message_encoding == RAW and direction in ("rx", "tx")
-    return (device, cast(Direction, direction)) if recorded else None
+    recorded = channel.message_encoding == RAW and direction in ("rx", "tx") and device
+    return device if recorded else None, cast(Direction, direction)
