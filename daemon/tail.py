@@ -8,6 +8,7 @@ written over, so that a half's worth is always there: seconds of four lasers at 
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import mmap
 import os
@@ -41,8 +42,9 @@ class Tail:
             raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
         fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o640)
         try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.posix_fallocate(fd, 0, _ABOUT_BYTES + 2 * _HALF_BYTES)  # no room is found out here, not later
-            self._map = mmap.mmap(fd, 0)
+            self._map = mmap.mmap(fd, 0)  # holds the file open, and so locked, too
         except OSError:
             self.path.unlink()
             raise
@@ -81,10 +83,15 @@ def rescue(folder: Path) -> None:
     Raises OSError: what was not moved stays where it is.
     """
     for path in folder.glob(_NAMED):
-        capture = Path(_about(path.read_bytes()).get("capture", ""))
-        if capture.is_file():
-            shutil.copyfile(path, beside(capture))
-        path.unlink()
+        with path.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:  # of a run that lives
+                continue
+            capture = Path(_about(file.read()).get("capture", ""))
+            if capture.is_file():
+                shutil.copyfile(path, beside(capture))
+            path.unlink()
 
 
 def beside(capture: Path) -> Path:

@@ -78,8 +78,12 @@ def test_what_a_killed_run_left_is_moved_beside_its_capture_and_only_once(tmp_pa
     for record in numbered(3):
         tail.put(record)
     rescue(tmp_path)
+    assert not beside(capture).exists()  # it lives
+    path = tail.path
+    del tail
+    rescue(tmp_path)
     assert read(beside(capture)) == numbered(3)
-    assert not tail.path.exists()
+    assert not path.exists()
     beside(capture).unlink()
     rescue(tmp_path)
     assert not beside(capture).exists()
