@@ -67,7 +67,7 @@ class Port:
 
     ``stop``, once set, makes the next ``read`` raise `Stopped`; clear it to say goodbye to the device.
     ``beat`` is called several times a second while somebody waits for chunks, also in a silence, unless the
-    thread that reads them is stuck. ``looked_s`` is when that last had nothing left to read.
+    thread that reads them is stuck. ``looked_s`` is when that last had taken what there was.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class Port:
         """
         self.stop.wait(seconds)
         self._look_up()
-        return [self._whole(each) for each in self._waiting()]
+        return self._waiting()
 
     def _look_up(self) -> None:
         if time.monotonic() - self.looked_s < _STUCK_S:
@@ -164,9 +164,9 @@ class Port:
             raise self._lost(item) from item
         return item
 
-    def _waiting(self) -> list[Chunk | Exception]:
-        """Take all that nobody has heard."""
-        return [self._unheard.get() for _ in range(self._unheard.qsize())]
+    def _waiting(self) -> list[Chunk]:
+        """Take all that nobody has heard. Raises DeviceLost."""
+        return [self._whole(self._unheard.get()) for _ in range(self._unheard.qsize())]
 
     def _take(self) -> None:
         """Read, stamp and record until the port is closed or lost."""
