@@ -224,11 +224,11 @@ def state(tmp_path):
     """A state folder with one accepted session, links that lead out of it, and what they lead to."""
     outside = tmp_path / "outside"
     outside.mkdir()
-    (outside / CALIBRATION).write_text("state: accepted\nsecret: yes\n")
+    (outside / CALIBRATION).write_text("state: accepted\nlasers: []\nsecret: yes\n")
     (outside / "session.yaml").write_text("created: never\n")
     folder = tmp_path / "state" / "sessions"
     (folder / "20260101T000000Z-yard" / "passes").mkdir(parents=True)
-    (folder / "20260101T000000Z-yard" / CALIBRATION).write_text("state: accepted\n")
+    (folder / "20260101T000000Z-yard" / CALIBRATION).write_text("state: accepted\nlasers: []\n")
     (folder / "20260102T000000Z-folder").symlink_to(outside)
     (folder / "20260103T000000Z-file").mkdir()
     (folder / "20260103T000000Z-file" / CALIBRATION).symlink_to(outside / CALIBRATION)
@@ -267,4 +267,4 @@ def test_a_session_is_only_one_in_the_state_folder_whatever_is_asked_of_it(setti
         service.handle({"class": "START", "continue": name})
     assert sorted(path.name for path in (tmp_path / "outside").iterdir()) == before
     last = service.handle({"class": "RESULT"})
-    assert last == {"class": "RESULT", "state": "accepted"}
+    assert last == {"class": "RESULT", "state": "accepted", "lasers": []}

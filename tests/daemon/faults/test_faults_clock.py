@@ -84,7 +84,7 @@ def test_a_session_begun_after_the_clock_was_set_back_still_is_the_last(wall, se
         wall.off = timedelta(hours=hours)
         session = sessions.create(tmp_path, config, None)
         made.append(session.id)
-        session.write_calibration({"state": "accepted", "of": session.id})
+        session.write_calibration({"state": "accepted", "lasers": [], "of": session.id})
         assert sessions.calibration_of(tmp_path, None)["of"] == session.id
         assert sessions.folder_of(tmp_path, None) == session.folder
         said = (datetime.now(UTC) + wall.off).isoformat(timespec="minutes")[:13]
