@@ -111,8 +111,9 @@ def place_known(turn: int, seed: int) -> np.ndarray:
     pole, ground = scatters_of(passes, 0.04)
     start = np.concatenate([RIG.mount.vector, np.zeros(len(EXTRAS))])
     form = Form(pole.form(used, 1.0), ground.form(used, 1.0))
-    total, mean = pole.weighted_mean(used, 1.0)  # from n's origin, where the pole is
-    known = replace(form, pole=form.pole + total / pole.count.sum() * np.outer(mean, mean))
+    weight = pole.weight(1.0)
+    mean = weight / weight.sum() @ pole.means(np.eye(len(form.pole)))  # from n's origin, where the pole is
+    known = replace(form, pole=form.pole + weight.sum() / pole.count.sum() * np.outer(mean, mean))
     return np.stack([minimise(of, start, EXTRAS)[:6] - start[:6] for of in (form, known)])
 
 
