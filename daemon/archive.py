@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from polecal.calib import CalibrationError, Kind, Pass, Returns
+from polecal.calib import Kind, Pass, Returns
 from polecal.calib.moments import Moments, of_sums
 from polecal.daemon import config as configuration
 from polecal.daemon import facts, recorder
@@ -31,6 +28,7 @@ from polecal.daemon.recorder import Event, RecorderError
 from polecal.daemon.replay import BEGIN, CHOICE
 from polecal.daemon.routine import State
 from polecal.daemon.sessions import (
+    DAMAGE,
     FACTS,
     QUALITY,
     REPLAY,
@@ -45,12 +43,6 @@ from polecal.daemon.spill import Spill
 
 _OF_THE_PLACE = ("state_dir", "runtime_dir", "storage", "page", "port")
 """Keys of the configuration that may change from day to day."""
-
-DAMAGE = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, CalibrationError),
-    *(zipfile.BadZipFile, zlib.error, yaml.YAMLError),
-)
-"""What numpy, zipfile and PyYAML raise on a file that is damaged, however it is."""
 
 
 def find(state_dir: Path, name: object) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polecal.calib import Kind, Mount, Returns, points_nav
-from polecal.daemon.archive import DAMAGE
+from polecal.daemon.sessions import DAMAGE
 
 _MOST_POINTS = 2400  # of a laser, in each of its two clouds
 _MOST_OF_A_PASS = 80

@@ -25,7 +25,6 @@ from typing import IO, Any, Self
 
 import numpy as np
 import pymap3d
-import yaml
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
@@ -41,7 +40,7 @@ from polecal.daemon.pipeline import Pipeline
 from polecal.daemon.recorder import Event, Record, RecorderError
 from polecal.daemon.replay import play
 from polecal.daemon.rows import OTHER
-from polecal.daemon.sessions import CALIBRATION
+from polecal.daemon.sessions import read_calibration
 from polecal.drivers.novatel_span import NavState
 from polecal.drivers.sick_lms import Decoded, beam_ages_s
 
@@ -242,12 +241,9 @@ class Decoder:
 
     def _calibration(self) -> tuple[str, dict[str, dict[str, Any]]]:
         """Give the state that the run came to, and each laser's entry."""
-        try:
-            said = yaml.safe_load((self._folder / CALIBRATION).read_text(encoding="utf-8"))
-            if all(entry["session"] == self._session for entry in said["lasers"]):
-                return said["state"], {entry["name"]: entry for entry in said["lasers"]}
-        except FileNotFoundError:
-            pass
+        said = read_calibration(self._folder)
+        if said is not None and all(entry["session"] == self._session for entry in said["lasers"]):
+            return said["state"], {entry["name"]: entry for entry in said["lasers"]}
         status = self._pipeline.status()
         return status["state"], {entry["name"]: entry for entry in status["lasers"]}
 

@@ -21,6 +21,7 @@ import structlog
 import yaml
 
 from polecal import PolecalError, __version__
+from polecal.calib import CalibrationError
 from polecal.calib.moments import WIDTH
 from polecal.daemon.config import Config, dump
 from polecal.daemon.facts import utc
@@ -34,6 +35,11 @@ CAPTURED_IN = "captured_in"
 CAPTURES = "capture*.mcap"
 """Matches all captures of a session's folder."""
 REPLAY = "make it anew from the capture: `polecal-field replay`"
+DAMAGE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, CalibrationError),
+    *(zipfile.BadZipFile, zlib.error, yaml.YAMLError),
+)
+"""What numpy, zipfile and PyYAML raise on a file that is damaged, however it is."""
 _LATER = "capture-{}.mcap"
 _STAMP = "%Y%m%dT%H%M%SZ"
 _STAMPED = re.compile(r"(\d{8}T\d{6}Z)-")
@@ -245,7 +251,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """Read a file that `Session` wrote. Raises SessionError."""
     try:
         content = yaml.load(path.read_bytes(), _LOADER)  # noqa: S506
-    except (OSError, ValueError, yaml.YAMLError) as error:
+    except DAMAGE as error:
         raise SessionError(f"{path}: cannot be read: {error}", REPLAY) from error
     if not isinstance(content, dict):
         raise SessionError(f"{path}: is not what polecal writes", REPLAY)
