@@ -181,7 +181,7 @@ class LaserChannel:
         if self._waiting and self._seen_ns - self._waiting[0].stx_ns >= _TOGETHER_NS:
             self._place_next()
         oldest_ns = self._waiting[0].stx_ns if self._waiting else self._seen_ns
-        return self._closed(oldest_ns) if oldest_ns > self._builder.ends_ns else []
+        return self._closed(oldest_ns)
 
     def _host_jumped(self) -> None:
         """Learn the mirror's clock anew, as the receiver's had to be.

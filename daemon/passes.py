@@ -21,7 +21,6 @@ from polecal.daemon.trajectory import Poses
 _OUT_OF_VIEW_NS = 1_500_000_000
 _LONGEST_NS = 60_000_000_000  # bounds what is kept of a vehicle that never turns away
 _FEWEST_POLE_RETURNS = 20
-_NEVER_NS = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +107,6 @@ class PassBuilder:
         """Ground returns left out, as they stood out of the ground."""
         self._slice_deg = slice_deg
         self._open: dict[int, OpenPass] = {}
-        self.ends_ns = _NEVER_NS
-        """Host time until which nothing ends that is open now."""
         self._site, self._count = site, count
 
     def add(
@@ -126,7 +123,6 @@ class PassBuilder:
         current = self._open.setdefault(place, OpenPass(place, *t_ns, []))
         current.last_ns = t_ns[1]
         current.parts.append((gps_ns, returns))
-        self.ends_ns = min(one.ends_ns for one in self._open.values())
 
     def close(self, mount: Mount, t_ns: int | None = None) -> list[StoredPass]:
         """Give the passes that have ended by host time ``t_ns``; all that are open if None.
@@ -160,7 +156,6 @@ class PassBuilder:
                     facts=facts.of(returns, gps_ns),
                 )
             )
-        self.ends_ns = min((one.ends_ns for one in self._open.values()), default=_NEVER_NS)
         return closed
 
     @property

@@ -139,9 +139,8 @@ class _Player:
     def play(self, item: Record | Event) -> None:
         """Do what was done when it was recorded."""
         self.last_ns = item.t_ns
-        if isinstance(item, Record):  # as `play`, which has much else to look at
-            if item.direction == "rx":
-                self._pipeline.feed(item.device, item.t_ns, item.data)
+        if isinstance(item, Record):
+            play(self._pipeline, item)
             return
         try:
             play(self._pipeline, item, as_told=self._as_told)

@@ -220,12 +220,9 @@ _UNCHECKED_KINDS = frozenset({Kind.ABBREVIATED, Kind.REPLY, Kind.PROMPT})
 _SHORT_KEY = struct.Struct("<HHI")  # id, week, ms of a short header, from its fifth byte on
 
 
-_ONES = 0xFFFFFFFF
-
-
 def crc32(data: bytes) -> int:
     """NovAtel's CRC-32: zlib's polynomial, starting at 0, without the final xor (sheet 1.4)."""
-    return zlib.crc32(data, _ONES) ^ _ONES
+    return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 _START = re.compile(rb"[\xaa#%$<\[\r]")
@@ -281,7 +278,7 @@ def _binary(buffer: bytes, at: int) -> _Match:
     end = match[1]
     if end > len(buffer):
         return end
-    return match if zlib.crc32(buffer[at:end], _ONES) == _ONES else Fault.CRC  # `crc32` over itself is 0
+    return match if crc32(buffer[at:end]) == 0 else Fault.CRC  # over its own CRC too it is 0
 
 
 def _line(buffer: bytes, at: int, most: int) -> tuple[int, int] | Fault | None:
