@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from typing import Any, Protocol
 
 import pytest
 
@@ -137,3 +138,21 @@ def connected(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Callable[[Peer],
         monkeypatch.setattr("polecal.drivers.device.Port", port)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def same_though_they_wait() -> Callable[[Callable[[], Any], bytes, Iterable[int]], None]:
+    """Hold a framer that hears chunks once it may lack no byte against one that hears each as it comes."""
+
+    def check(framer: Callable[[], Any], data: bytes, cuts: Iterable[int]) -> None:
+        at_once, waiting = framer(), framer()
+        chunks, lacking = [], waiting.lacking
+        for a, b in pairwise([0, *sorted(cuts), len(data)]):
+            frames, other = at_once.feed(data[a:b], a), []
+            chunks.append((data[a:b], a))
+            lacking -= b - a
+            if lacking <= 0:
+                other, chunks, lacking = waiting.feed_all(chunks), [], waiting.lacking
+            assert other == frames
+
+    return check

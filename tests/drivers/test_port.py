@@ -40,58 +40,59 @@ class Taps:
             assert self._more.wait_for(lambda: self.read() == read, 5.0), self.seen
 
 
-def test_what_comes_is_stamped_and_recorded_before_anybody_asks_for_it(line):
+@pytest.fixture
+def opened(line):
+    """The device's end, the open port, and what of it was recorded."""
     device, path = line
     taps = Taps()
     with Port(path, 9600, taps) as port:
-        before_ns = time.monotonic_ns()
-        device.write(b"one")
-        taps.until(b"one")
-        after_ns = time.monotonic_ns()
-        device.write(b"two")
-        taps.until(b"onetwo")
-        chunks = [port.read(1.0), port.read(1.0)]
+        yield device, port, taps
+
+
+def test_what_comes_is_stamped_and_recorded_before_anybody_asks_for_it(opened):
+    device, port, taps = opened
+    before_ns = time.monotonic_ns()
+    device.write(b"one")
+    taps.until(b"one")
+    after_ns = time.monotonic_ns()
+    device.write(b"two")
+    taps.until(b"onetwo")
+    chunks = [port.read(1.0), port.read(1.0)]
     assert [(chunk.t_ns, chunk.data) for chunk in chunks] == [(t_ns, data) for _, t_ns, data in taps.seen]
     assert before_ns < chunks[0].t_ns < after_ns < chunks[1].t_ns
 
 
-def test_many_chunks_are_gathered_in_their_order_and_each_once(line):
-    device, path = line
-    taps = Taps()
-    with Port(path, 9600, taps) as port:
-        sent = b""
-        for number in range(MANY):
-            sent += b"%d," % number
-            device.write(b"%d," % number)
-            taps.until(sent)
-        chunks = port.gather(0.0)
-        assert port.gather(0.0) == []
+def test_many_chunks_are_gathered_in_their_order_and_each_once(opened):
+    device, port, taps = opened
+    sent = b""
+    for number in range(MANY):
+        sent += b"%d," % number
+        device.write(b"%d," % number)
+        taps.until(sent)
+    chunks = port.gather(0.1)
+    assert port.gather(0.0) == []
     assert len(chunks) == MANY
     assert b"".join(chunk.data for chunk in chunks) == sent
 
 
-def test_a_change_of_rate_drops_what_nobody_has_heard(line):
-    device, path = line
-    taps = Taps()
-    with Port(path, 9600, taps) as port:
-        device.write(b"at the old rate")
-        taps.until(b"at the old rate")
-        port.set_baud(38400)
-        device.write(b"new")
-        assert port.read(1.0).data == b"new"
+def test_a_change_of_rate_drops_what_nobody_has_heard(opened):
+    device, port, taps = opened
+    device.write(b"at the old rate")
+    taps.until(b"at the old rate")
+    port.set_baud(38400)
+    device.write(b"new")
+    assert port.read(1.0).data == b"new"
 
 
-def test_a_port_that_hangs_up_is_lost_to_whoever_asks_and_what_came_before_is_heard(line):
-    device, path = line
-    taps = Taps()
-    with Port(path, 9600, taps) as port:
-        device.write(b"last words")
-        taps.until(b"last words")
-        device.close()
-        assert port.read(1.0).data == b"last words"
-        for ask in (port.read, port.gather, lambda _: port.set_baud(9600), port.read):
-            with pytest.raises(DeviceLost, match="stopped working"):
-                ask(0.1)
+def test_a_port_that_hangs_up_is_lost_to_whoever_asks_and_what_came_before_is_heard(opened):
+    device, port, taps = opened
+    device.write(b"last words")
+    taps.until(b"last words")
+    device.close()
+    assert port.read(1.0).data == b"last words"
+    for ask in (port.read, port.gather, lambda _: port.set_baud(9600), port.read):
+        with pytest.raises(DeviceLost, match="stopped working"):
+            ask(0.1)
 
 
 @pytest.mark.parametrize("ask", ["read", "gather"])

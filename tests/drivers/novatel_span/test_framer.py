@@ -252,17 +252,11 @@ def test_frames_do_not_depend_on_how_the_stream_is_cut(stream):
 
 
 @given(streams())
-def test_chunks_that_wait_until_no_byte_is_lacking_give_the_same_frames_at_the_same_time(stream):
+def test_chunks_that_wait_until_no_byte_is_lacking_give_the_same_frames_at_the_same_time(
+    same_though_they_wait, stream
+):
     data, cuts = stream
-    at_once, waiting = Framer(), Framer()
-    chunks, lacking = [], waiting.lacking
-    for a, b in pairwise([0, *sorted(cuts), len(data)]):
-        frames, other = at_once.feed(data[a:b], a), []
-        chunks.append((data[a:b], a))
-        lacking -= b - a
-        if lacking <= 0:
-            other, chunks, lacking = waiting.feed_all(chunks), [], waiting.lacking
-        assert other == frames
+    same_though_they_wait(Framer, data, cuts)
 
 
 @given(streams())

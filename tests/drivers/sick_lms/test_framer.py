@@ -266,18 +266,11 @@ def test_any_split_gives_the_same(stream, data):
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(telegrams, max_size=8), st.data())
-def test_chunks_that_wait_until_no_byte_is_lacking_give_the_same_telegrams_at_the_same_time(several, data):
+def test_chunks_that_wait_until_no_byte_is_lacking_give_the_same_telegrams_at_the_same_time(
+    same_though_they_wait, several, data
+):
     stream = b"".join(each for each in several if ACK + b"\x02" not in each)
-    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=20)))
-    at_once, waiting = Framer(), Framer()
-    chunks, lacking = [], waiting.lacking
-    for a, b in pairwise([0, *cuts, len(stream)]):
-        frames, other = at_once.feed(stream[a:b], a), []
-        chunks.append((stream[a:b], a))
-        lacking -= b - a
-        if lacking <= 0:
-            other, chunks, lacking = waiting.feed_all(chunks), [], waiting.lacking
-        assert other == frames
+    same_though_they_wait(Framer, stream, data.draw(st.lists(st.integers(0, len(stream)), max_size=20)))
 
 
 @settings(max_examples=200, deadline=None)
